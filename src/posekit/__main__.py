@@ -1,0 +1,5 @@
+"""``python -m posekit`` is ``posekit``."""
+
+from posekit.cli.app import main
+
+main()

@@ -1,0 +1,152 @@
+"""Pictures for people: contours, axes, boxes, captions, strips and contact sheets. Layer 2.
+
+Every function takes and returns uint8 RGB (H, W, 3) and leaves its input as it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from posekit.camera import Box, Camera
+from posekit.geometry import Pose
+
+Image = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+Colour = tuple[int, int, int]
+
+WHITE: Colour = (255, 255, 255)
+BLACK: Colour = (0, 0, 0)
+PAPER: Colour = (24, 26, 30)  # behind tiles
+GREEN: Colour = (64, 255, 96)  # what was found
+ORANGE: Colour = (255, 170, 30)  # what was given
+AXES: tuple[Colour, Colour, Colour] = ((255, 70, 70), (80, 230, 80), (80, 140, 255))  # x, y, z
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+
+
+def contour(image: Image, mask: Mask, colour: Colour = GREEN) -> Image:
+    """The outline of a mask (H, W), holes included, with a dark rim so that it shows on any ground."""
+    outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    width = _line_width(image)
+    out = cv2.drawContours(image.copy(), outlines, -1, BLACK, width + 2, cv2.LINE_AA)
+    return _image(cv2.drawContours(out, outlines, -1, colour, width, cv2.LINE_AA))
+
+
+def axes(image: Image, camera: Camera, T_cam_obj: Pose, length: float, origin: Sequence[float] = (0, 0, 0)) -> Image:
+    """The object's x (red), y (green) and z (blue) axis, the farthest drawn first.
+
+    length: metres. origin: (3,) metres in the object's frame, where the axes start. An axis that begins or ends
+    behind the camera is left out.
+    """
+    start = np.asarray(origin, dtype=np.float64)
+    points = T_cam_obj.apply(np.stack([start, *(start + length * np.eye(3))]))
+    out = image.copy()
+    if points[0, 2] <= 0:
+        return out
+    width = _line_width(image) + 1
+    for axis in sorted(range(3), key=lambda k: -points[k + 1, 2]):
+        if points[axis + 1, 2] <= 0:
+            continue
+        tail, head = (_pixel(p) for p in camera.project(points[[0, axis + 1]]))
+        cv2.arrowedLine(out, tail, head, BLACK, width + 2, cv2.LINE_AA, tipLength=0.15)
+        cv2.arrowedLine(out, tail, head, AXES[axis], width, cv2.LINE_AA, tipLength=0.15)
+    return out
+
+
+def box(image: Image, edges: Box, colour: Colour = ORANGE) -> Image:
+    """A box given by its edges; its line runs along the outermost pixels inside it."""
+    x0, y0, x1, y1 = (round(v) for v in edges)
+    return _image(cv2.rectangle(image.copy(), (x0, y0), (x1 - 1, y1 - 1), colour, _line_width(image)))
+
+
+def caption(image: Image, text: str, colour: Colour = WHITE) -> Image:
+    """One line of text on a darkened bar along the top; text that does not fit is made smaller."""
+    height, width = image.shape[:2]
+    size = float(np.clip(width / 500, 0.32, 0.9))
+    (text_width, _), _ = cv2.getTextSize(text, FONT, size, 1)
+    size *= min(1.0, (width - 6) / max(text_width, 1))
+    (_, text_height), below = cv2.getTextSize(text, FONT, size, 1)
+    bar = min(height, text_height + below + 4)
+    out = image.copy()
+    out[:bar] = (out[:bar] * 0.35).astype(np.uint8)
+    return _image(cv2.putText(out, text, (3, text_height + 2), FONT, size, colour, 1, cv2.LINE_AA))
+
+
+def grid(images: Sequence[Image], columns: int | None = None, captions: Sequence[str] = (), gap: int = 4) -> Image:
+    """A contact sheet of pictures of one size, row by row; about square where ``columns`` is not given.
+
+    captions: one for each picture, or none. Raises ValueError where there is no picture or sizes differ.
+    """
+    if not images or len({image.shape for image in images}) != 1:
+        raise ValueError(f"a grid needs pictures of one size, not {[image.shape for image in images]}")
+    tiles = [caption(image, text) for image, text in zip(images, captions, strict=True)] if captions else images
+    height, width = images[0].shape[:2]
+    columns = min(len(tiles), columns or round(np.sqrt(len(tiles) * 1.34)))
+    rows = -(-len(tiles) // columns)
+    sheet = _paper(rows * (height + gap) - gap, columns * (width + gap) - gap)
+    for k, tile in enumerate(tiles):
+        y, x = k // columns * (height + gap), k % columns * (width + gap)
+        sheet[y : y + height, x : x + width] = tile
+    return sheet
+
+
+def strip(images: Sequence[Image], captions: Sequence[str], width: int, gap: int = 4) -> Image:
+    """Pictures of one size in one row exactly ``width`` pixels wide, each with its caption."""
+    count = len(images)
+    tile = max(1, (width - (count - 1) * gap) // count)
+    height = max(1, round(tile * images[0].shape[0] / images[0].shape[1]))
+    row = grid([fit(image, (tile, height)) for image in images], count, captions, gap)
+    sheet = _paper(height, width)
+    left = (width - row.shape[1]) // 2
+    sheet[:, left : left + row.shape[1]] = row
+    return sheet
+
+
+def stack(images: Sequence[Image], gap: int = 4) -> Image:
+    """Pictures below each other, each at the left, over a common ground."""
+    width = max(image.shape[1] for image in images)
+    sheet = _paper(sum(image.shape[0] + gap for image in images) - gap, width)
+    top = 0
+    for image in images:
+        sheet[top : top + image.shape[0], : image.shape[1]] = image
+        top += image.shape[0] + gap
+    return sheet
+
+
+def fit(image: Image, size: tuple[int, int]) -> Image:
+    """A picture resized to (width, height), averaged where it shrinks."""
+    shrinks = size[0] < image.shape[1]
+    return _image(cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC))
+
+
+def png(image: Image | Mask) -> bytes:
+    """A picture (H, W, 3) or a mask (H, W), 0 and 255, encoded as PNG."""
+    if image.dtype == np.bool_:
+        image = image.astype(np.uint8) * np.uint8(255)
+    pixels = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
+    done, data = cv2.imencode(".png", pixels)
+    if not done:
+        raise ValueError(f"an array of shape {image.shape} and type {image.dtype} cannot become a PNG")
+    return data.tobytes()
+
+
+def _line_width(image: Image) -> int:
+    return max(1, round(max(image.shape[:2]) / 640))
+
+
+def _pixel(point: NDArray[np.float64]) -> tuple[int, int]:
+    """The nearest pixel; far outside points stay where OpenCV's integers can hold them."""
+    x, y = np.clip(np.rint(point), -10_000, 30_000).astype(int)
+    return int(x), int(y)
+
+
+def _paper(height: int, width: int) -> Image:
+    return np.full((height, width, 3), PAPER, dtype=np.uint8)
+
+
+def _image(array: object) -> Image:
+    """What OpenCV returns, with the type that its stubs leave open."""
+    return np.asarray(array, dtype=np.uint8)

@@ -1,0 +1,152 @@
+"""PoseEstimator: detect, first pose, refine, choose. Layer 4."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from posekit.camera import Box
+from posekit.errors import ConfigError, WeightsError
+from posekit.geometry import Pose
+from posekit.hypotheses import Hypothesis, TemplateSearch
+from posekit.nets.predictor import NetworkPredictor
+from posekit.nets.weights import load_networks
+from posekit.object_model import ObjectModel
+from posekit.refine import Refinement, RefineOptions, refine
+from posekit.render import Renderer
+from posekit.results import Detection, Estimate
+from posekit.view import View
+
+INITS = ("templates", "mvnet")
+
+
+@dataclass(frozen=True)
+class EstimateOptions:
+    """init: where first poses come from. hypotheses: how many of them are refined. seed: for whatever is drawn at
+    random. The rest is RefineOptions', with the angle in degrees."""
+
+    init: str = "templates"
+    hypotheses: int = 5
+    update: str = "correspondence"
+    stop: str = "angle"
+    iterations: int = 50
+    stop_angle_deg: float = 2.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.init not in INITS:
+            raise ConfigError(f"init is one of {INITS}, not {self.init!r}.")
+        if self.hypotheses < 1:
+            raise ConfigError(f"at least 1 hypothesis is needed, not {self.hypotheses}.")
+        self.refine_options  # checks the rest
+
+    @property
+    def refine_options(self) -> RefineOptions:
+        return RefineOptions(self.update, self.stop, self.iterations, float(np.deg2rad(self.stop_angle_deg)))
+
+
+class PoseEstimator:
+    """Estimates the pose of one object in photographs.
+
+    Not thread-safe: one estimator per thread. Raises WeightsError where the preset has no weights.
+    """
+
+    def __init__(
+        self,
+        model: ObjectModel,
+        *,
+        preset: str = "lite",
+        weights: Path | None = None,
+        options: EstimateOptions = EstimateOptions(),
+        threads: int | None = None,
+    ) -> None:
+        import torch
+
+        if threads is not None:
+            torch.set_num_threads(threads)
+        torch.manual_seed(options.seed)
+        self.model, self.options = model, options
+        self.networks = load_networks(preset, weights)
+        if options.init == "mvnet" and self.networks.mvnet is None:
+            raise WeightsError(
+                f"the {preset} weights {self.networks.digest} hold no trained MV-Net: use --init templates."
+            )
+        self.predictor = NetworkPredictor(self.networks)
+        self.renderer = Renderer()
+        self._search: TemplateSearch | None = None
+
+    @property
+    def weights_hash(self) -> str:
+        return self.networks.digest
+
+    def estimate(self, view: View, detections: Sequence[Detection]) -> list[Estimate]:
+        """One estimate for each detection that gives a silhouette to start from, in their order."""
+        estimates = []
+        for detection in detections:
+            started = time.perf_counter()
+            first = self.first_poses(view, detection)
+            searched = time.perf_counter()
+            if not first:
+                continue
+            masked = view.with_mask(detection.mask) if detection.mask is not None else view.with_mask(None)
+            poses = [h.T_cam_obj for h in first]
+            refined = refine(masked, self.model, poses, self.predictor, self.renderer, self.options.refine_options)
+            done = time.perf_counter()
+            timings = {"first_pose": searched - started, "refine": done - searched, "total": done - started}
+            estimates.append(self._choose(masked, refined, detection, timings))
+        return estimates
+
+    def refine(self, view: View, T_cam_obj: Pose) -> Estimate:
+        """Refine a known pose; view.mask, where there is one, helps."""
+        started = time.perf_counter()
+        refined = refine(view, self.model, [T_cam_obj], self.predictor, self.renderer, self.options.refine_options)
+        seconds = time.perf_counter() - started
+        return self._choose(view, refined, None, {"refine": seconds, "total": seconds})
+
+    def first_poses(self, view: View, detection: Detection) -> list[Hypothesis]:
+        """The first poses that ``options.init`` gives, best first."""
+        if self._search is None:
+            self._search = TemplateSearch(self.model, self.renderer)
+        return self._search.search(view, detection, self.options.hypotheses)
+
+    def _choose(
+        self, view: View, refined: Sequence[Refinement], detection: Detection | None, timings: dict[str, float]
+    ) -> Estimate:
+        """The hypothesis with the best score: a low predicted angle, and a silhouette that agrees with the mask."""
+        scores = [score(r, agreement) for r, agreement in zip(refined, self._agreements(view, refined), strict=True)]
+        k = int(np.argmax(scores))
+        best = refined[k]
+        return Estimate(
+            T_cam_obj=best.T_cam_obj,
+            angle=best.angle,
+            iterations=best.iterations,
+            converged=best.converged,
+            score=float(scores[k]),
+            box=self._box(view, best.T_cam_obj),
+            model=self.model.name,
+            detection=detection,
+            trace=best.trace,
+            timings=timings,
+        )
+
+    def _agreements(self, view: View, refined: Sequence[Refinement]) -> list[float]:
+        """Intersection over union of each final silhouette and the view's mask; 1 where there is no mask."""
+        if view.mask is None:
+            return [1.0] * len(refined)
+        drawn = self.renderer.render(self.model, [r.T_cam_obj for r in refined], view.camera, coords=False)
+        masks = [d.mask for d in drawn]
+        return [float((m & view.mask).sum() / max(1, (m | view.mask).sum())) for m in masks if m is not None]
+
+    def _box(self, view: View, T_cam_obj: Pose) -> Box:
+        points = T_cam_obj.apply(self.model.outline)
+        points[:, 2] = np.maximum(points[:, 2], 1e-3)
+        return view.camera.points_box(points)
+
+
+def score(refinement: Refinement, agreement: float) -> float:
+    """Between 0 and 1: exp(-angle / 15 degrees) times the silhouettes' agreement."""
+    return float(np.exp(-refinement.angle / np.deg2rad(15.0)) * agreement)

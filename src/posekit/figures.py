@@ -1,0 +1,74 @@
+"""What an estimate looks like: the overlay and the strip of its refinement. Layer 3."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from posekit import draw
+from posekit.draw import Image
+from posekit.geometry import Pose
+from posekit.object_model import ObjectModel
+from posekit.render import Renderer
+from posekit.results import Estimate
+from posekit.view import View
+from posekit.zoom import zoom_to_box
+
+_WIDTHS = (640, 1600)  # pixels of the overlay, whatever the photograph has
+_TILE = (320, 240)
+_ITERATIONS = 3  # tiles of the strip between the first and the final pose
+_CONTEXT = 1.3  # a tile shows this many boxes
+
+
+def overlay(renderer: Renderer, model: ObjectModel, view: View, estimates: Sequence[Estimate]) -> Image:
+    """The photograph with each estimate's contour, axes and box; below it, a strip for each."""
+    shown = _display_size(view)
+    scale = shown.camera.width / view.camera.width
+    picture = shown.image
+    for estimate in estimates:
+        [drawn] = renderer.render(model, [estimate.T_cam_obj], shown.camera, rgb=False, coords=False)
+        assert drawn.mask is not None
+        x0, y0, x1, y1 = (scale * v for v in _given_box(estimate))
+        picture = draw.box(picture, (x0, y0, x1, y1))
+        picture = draw.contour(picture, drawn.mask)
+        picture = draw.axes(picture, shown.camera, estimate.T_cam_obj, 0.6 * float(model.extents.max()), model.center)
+    strips = [strip(renderer, model, view, estimate, picture.shape[1]) for estimate in estimates]
+    return draw.stack([picture, *strips])
+
+
+def strip(renderer: Renderer, model: ObjectModel, view: View, estimate: Estimate, width: int) -> Image:
+    """Crop, first pose, iterations and final pose in one row of ``width`` pixels, with the predicted errors."""
+    zoom = zoom_to_box(view.camera, estimate.box, _TILE, enlarge=_CONTEXT)
+    crop = view.with_mask(None).zoomed(zoom)
+    titles, poses = _chosen_steps(estimate)
+    turned = [Pose.rotation(zoom.R_view_cam) @ pose for pose in poses]
+    tiles = [crop.image]
+    for drawn in renderer.render(model, turned, zoom.camera, rgb=False, coords=False):
+        assert drawn.mask is not None
+        tiles.append(draw.contour(crop.image, drawn.mask))
+    return draw.strip(tiles, ["crop", *titles], width)
+
+
+def _chosen_steps(estimate: Estimate) -> tuple[list[str], list[Pose]]:
+    """Titles and poses: the first of the trace, a few evenly spread ones after it, and the final pose."""
+    later = range(1, len(estimate.trace))
+    chosen = later if len(later) <= _ITERATIONS else [int(k) for k in np.linspace(0, len(later), _ITERATIONS + 2)[1:-1]]
+    kept = [0, *chosen] if estimate.trace else []
+    titles = [f"{f'step {k}' if k else 'first'}: {np.rad2deg(estimate.trace[k].angle):.1f} deg" for k in kept]
+    poses = [estimate.trace[k].T_cam_obj for k in kept]
+    return [*titles, f"final: {np.rad2deg(estimate.angle):.1f} deg"], [*poses, estimate.T_cam_obj]
+
+
+def _given_box(estimate: Estimate) -> tuple[float, float, float, float]:
+    """Where the object was said to be, else where it was found to be."""
+    return estimate.detection.box if estimate.detection is not None else estimate.box
+
+
+def _display_size(view: View) -> View:
+    """The view without its mask, scaled so that its width suits a screen."""
+    width = int(np.clip(view.camera.width, *_WIDTHS))
+    if width == view.camera.width:
+        return view.with_mask(None)
+    height = max(1, round(view.camera.height * width / view.camera.width))
+    return View(draw.fit(view.image, (width, height)), view.camera.resized(width, height))

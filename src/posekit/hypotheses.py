@@ -1,0 +1,184 @@
+"""First poses: the template search, and MV-Net. Layer 3.
+
+The search renders the mesh from a few hundred directions once, and compares each template, turned in the picture
+plane, with the observed crop: how well the silhouettes agree, and how well the colours do once brightness and contrast
+are taken out. Nothing in it is learned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from posekit.camera import Camera, mask_box
+from posekit.errors import PromptError
+from posekit.geometry import Pose, fibonacci_sphere, rotation_angle, so3_exp, view_rotation
+from posekit.object_model import ObjectModel
+from posekit.render import Light, Renderer
+from posekit.results import Detection
+from posekit.view import View
+from posekit.zoom import zoom_to_box
+
+Array = NDArray[np.float64]
+FArray = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class TemplateOptions:
+    """views: directions over the sphere. turns: in-plane rotations. size: side of the compared patches in pixels.
+    colour: weight of the colour agreement against the silhouettes'. apart: least angle between two hypotheses."""
+
+    views: int = 200
+    turns: int = 24
+    size: int = 32
+    colour: float = 0.5
+    apart: float = float(np.deg2rad(20.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """T_cam_obj: a first pose. score: higher is better, comparable within one search only."""
+
+    T_cam_obj: Pose
+    score: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Patch:
+    """A silhouette fitted into a square: mask float32 (s, s); colour float32 (s, s, 3), zero mean and unit
+    variance inside the mask, zero outside. centre: (2,) the box's centre and half: half its longer side, in the
+    source picture's pixels."""
+
+    mask: FArray
+    colour: FArray
+    centre: Array
+    half: float
+
+
+def _patch(image: NDArray[np.uint8], mask: NDArray[np.uint8], size: int, turn: float = 0.0) -> _Patch | None:
+    """The masked object, turned by ``turn`` radians (clockwise in the picture), fitted into a square of ``size``."""
+    points = cv2.findNonZero(mask)
+    if points is None:
+        return None
+    uv = points[:, 0].astype(np.float64)
+    c, s = np.cos(turn), np.sin(turn)
+    R = np.array([[c, -s], [s, c]])
+    turned = uv @ R.T
+    low, high = turned.min(0), turned.max(0)
+    half = 0.5 * float((high - low).max() + 1)
+    middle = 0.5 * (low + high)
+    scale = 0.5 * size / half
+    # from source pixels to patch pixels: turn, move the box's middle to the patch's, scale
+    M = np.zeros((2, 3))
+    M[:, :2] = scale * R
+    M[:, 2] = 0.5 * (size - 1) - scale * middle
+    flags = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    soft = cv2.warpAffine(mask.astype(np.float32), M, (size, size), flags=flags) > 0.5
+    colour = cv2.warpAffine(image, M, (size, size), flags=flags).astype(np.float32)
+    if soft.sum() < 8:
+        return None
+    inside = colour[soft]
+    colour = (colour - inside.mean(0)) / (inside.std() + 4.0)
+    colour[~soft] = 0
+    return _Patch(soft.astype(np.float32), colour, middle @ R, half)
+
+
+class TemplateSearch:
+    """First poses by comparison with rendered templates; the templates are made once per mesh."""
+
+    def __init__(self, model: ObjectModel, renderer: Renderer, options: TemplateOptions = TemplateOptions()) -> None:
+        self.model, self.options = model, options
+        self.rotations = [view_rotation(d) for d in fibonacci_sphere(options.views)]
+        side = 64
+        self.distance = 4.0 * model.diameter
+        focal = 0.9 * side * self.distance / model.diameter
+        self.camera = Camera(focal, focal, 0.5 * side - 0.5, 0.5 * side - 0.5, side, side)
+        T_ctr_obj = model.T_obj_ctr.inverse()
+        poses = [Pose(R, np.array([0, 0, self.distance])) @ T_ctr_obj for R in self.rotations]
+        views = renderer.render(model, poses, self.camera, light=Light(), coords=False)
+        found = [_patch(v.image, _u8(v.mask), options.size) for v in views]
+        self.kept = [k for k, patch in enumerate(found) if patch is not None]
+        self.patches = [patch for patch in found if patch is not None]
+        if not self.patches:
+            raise PromptError(f"{model.name} leaves no silhouette from any side: its surface is too thin to search.")
+        self.masks = np.stack([p.mask.ravel() for p in self.patches])
+        self.colours = np.stack([p.colour.ravel() for p in self.patches])
+
+    def search(self, view: View, detection: Detection, count: int) -> list[Hypothesis]:
+        """The best ``count`` first poses for a detection, best first, none nearer to another than ``apart``.
+
+        view: the photograph. detection: its box and, better, its mask; without a mask the filled box is compared.
+        """
+        zoom = zoom_to_box(view.camera, detection.box, (128, 128), enlarge=1.15)
+        mask = detection.mask if detection.mask is not None else box_mask(detection.box, view.camera)
+        crop = view.with_mask(mask).zoomed(zoom)
+        if crop.mask is None or not crop.mask.any():
+            return []
+        turns = np.arange(self.options.turns) * (2 * np.pi / self.options.turns)
+        patches = [_patch(crop.image, _u8(crop.mask), self.options.size, turn) for turn in turns]
+        usable = [(turn, patch) for turn, patch in zip(turns, patches, strict=True) if patch is not None]
+        if not usable:
+            return []
+        scores = self._scores([patch for _, patch in usable])  # (turns, templates)
+        found: list[Hypothesis] = []
+        for flat in np.argsort(-scores, axis=None):
+            row, column = np.unravel_index(flat, scores.shape)
+            turn, patch = usable[int(row)]
+            pose = self._pose(crop, turn, patch, int(column))
+            if all(rotation_angle(pose.R.T @ h.T_cam_obj.R) > self.options.apart for h in found):
+                found.append(Hypothesis(pose, float(scores[row, column])))
+            if len(found) == count:
+                break
+        return found
+
+    def _scores(self, observed: Sequence[_Patch]) -> Array:
+        masks = np.stack([p.mask.ravel() for p in observed])
+        colours = np.stack([p.colour.ravel() for p in observed])
+        both = masks @ self.masks.T
+        union = masks.sum(1)[:, None] + self.masks.sum(1)[None] - both
+        agreement = colours @ self.colours.T / (3 * np.maximum(both, 1.0))
+        return (both / union + self.options.colour * np.clip(agreement, -1, 1)).astype(np.float64)
+
+    def _pose(self, crop: View, turn: float, patch: _Patch, column: int) -> Pose:
+        """The template's pose turned back, at the depth and place that the two boxes give (in the photograph)."""
+        template = self.patches[column]
+        # the observed crop was turned by ``turn`` to look like the template: the object is turned by -turn
+        R_turn = so3_exp([0.0, 0.0, -turn])
+        R = R_turn @ self.rotations[self.kept[column]]
+        size_here = patch.half / crop.camera.fx
+        size_there = template.half / self.camera.fx
+        depth = self.distance * size_there / size_here
+        # the object's centre lies beside its box's centre by this much of the box
+        offset = (np.array([self.camera.cx, self.camera.cy]) - template.centre) / template.half * patch.half
+        pixel = patch.centre + R_turn[:2, :2] @ offset
+        T_view_ctr = Pose(R, crop.camera.backproject(pixel, depth))
+        ray_turn = rotation_to_ray(T_view_ctr.t)
+        T_view_ctr = Pose(ray_turn @ T_view_ctr.R, T_view_ctr.t)  # seen along this ray it looks as the template does
+        return Pose.rotation(crop.R_view_cam.T) @ T_view_ctr @ self.model.T_obj_ctr.inverse()
+
+
+def rotation_to_ray(t: Array) -> Array:
+    """The viewing-ray rotation (3, 3): turns what was seen on the optical axis to look the same along ``t`` (3,)."""
+    from posekit.geometry import rotation_between
+
+    return rotation_between([0.0, 0.0, 1.0], t)
+
+
+def box_mask(box: tuple[float, float, float, float], camera: Camera) -> NDArray[np.bool_]:
+    """The filled box as a mask (H, W)."""
+    mask = np.zeros((camera.height, camera.width), bool)
+    x0, y0, x1, y1 = (int(round(v)) for v in box)
+    mask[max(0, y0) : max(0, y1), max(0, x0) : max(0, x1)] = True
+    return mask
+
+
+def _u8(mask: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
+    assert mask is not None
+    return mask.astype(np.uint8)
+
+
+__all__ = ["Hypothesis", "TemplateOptions", "TemplateSearch", "box_mask", "mask_box"]

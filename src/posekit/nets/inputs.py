@@ -1,0 +1,27 @@
+"""From pictures to network inputs; the only place that does it."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+
+def to_input(image: NDArray[np.uint8], mask: NDArray[np.bool_] | None) -> NDArray[np.float32]:
+    """uint8 RGB (..., H, W, 3) and bool (..., H, W) -> float32 (..., 4, H, W): RGB in [-0.5, 0.5], mask 0 or 1.
+
+    A missing mask is a channel of zeros: the networks are trained to do without.
+    """
+    out = np.zeros((*image.shape[:-3], 4, *image.shape[-3:-1]), dtype=np.float32)
+    out[..., :3, :, :] = np.moveaxis(image, -1, -3) * np.float32(1 / 255) - np.float32(0.5)
+    if mask is not None:
+        out[..., 3, :, :] = mask
+    return out
+
+
+def images_to_tensor(rgbm: Tensor) -> Tensor:
+    """uint8 (B, H, W, 4), alpha = mask (0 or 255) -> float32 (B, 4, H, W) as ``to_input`` gives it."""
+    x = rgbm.permute(0, 3, 1, 2).float().div(255.0)
+    offset = x.new_tensor([0.5, 0.5, 0.5, 0.0]).view(1, 4, 1, 1)
+    return (x - offset).contiguous(memory_format=torch.channels_last)

@@ -1,0 +1,114 @@
+"""Losses: the paper's equations 1 and 2, and the lite preset's dense ones. See docs/decisions/0002."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from posekit.nets.heads import PoseHeads, Prediction, compress_angle
+
+
+def paper_pose_loss(prediction: Prediction, heads: PoseHeads, quat_wxyz: Tensor, v: Tensor) -> Tensor:
+    """The part that equations 1 and 2 share, averaged over the batch:
+
+        |1 - q . q^/||q^|| | + ||t - t^|| + |1 - ||q^|| |
+
+    quat_wxyz: (B, 4), unit, w >= 0. v: (B, 3). t is v in normalised units; ||t - t^|| is the Euclidean norm.
+    """
+    length = prediction.quat_wxyz.norm(dim=1)
+    cosine = (quat_wxyz * prediction.quat_wxyz).sum(1) / length.clamp_min(1e-8)
+    translation = ((v - prediction.v) / heads.v_std).norm(dim=1)
+    return ((1 - cosine).abs() + translation + (1 - length).abs()).mean()
+
+
+def mvnet_loss(prediction: Prediction, heads: PoseHeads, quat_wxyz: Tensor, v: Tensor, views: int = 6) -> Tensor:
+    """Equation 1, N = views."""
+    return paper_pose_loss(prediction, heads, quat_wxyz, v) / views
+
+
+def svnet_loss(prediction: Prediction, heads: PoseHeads, quat_wxyz: Tensor, v: Tensor, angle: Tensor) -> Tensor:
+    """Equation 2; angle: (B,), radians."""
+    assert prediction.angle is not None
+    return paper_pose_loss(prediction, heads, quat_wxyz, v) + (angle - prediction.angle).abs().mean()
+
+
+@dataclass(frozen=True)
+class DenseLossConfig:
+    """Weights of the lite preset's losses. hidden: weight of anchors that the observed picture does not show."""
+
+    gamma: float = 0.8
+    hidden: float = 0.3
+    flow: float = 0.25
+    likelihood: float = 0.5
+    visibility: float = 1.0
+    rotation: float = 1.0
+    translation: float = 1.0
+    angle: float = 1.0
+    max_flow_px: float = 80.0
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """The truth of B pairs on h x w anchors; see ``data.pairs.Pair``. lost: bool (B,)."""
+
+    flow: Tensor  # (B, 2, h, w)
+    valid: Tensor  # (B, h, w) bool
+    visible: Tensor  # (B, h, w) bool
+    quat_wxyz: Tensor  # (B, 4)
+    v: Tensor  # (B, 3)
+    angle: Tensor  # (B,)
+    lost: Tensor  # (B,) bool
+
+
+def dense_loss(
+    prediction: Prediction,
+    flows: list[Tensor],
+    compressed_angle: Tensor,
+    heads: PoseHeads,
+    target: Target,
+    config: DenseLossConfig = DenseLossConfig(),
+) -> tuple[Tensor, dict[str, float]]:
+    """The lite preset's loss and its parts.
+
+    flows: (B, 2, h/2, w/2) in pixels after each update. Lost pairs teach the angle only.
+    """
+    assert prediction.flow is not None and prediction.log_scale is not None and prediction.visibility is not None
+    near = (target.flow.abs().amax(1) < config.max_flow_px) & target.valid & ~target.lost[:, None, None]
+    weight = near * (config.hidden + (1 - config.hidden) * target.visible)
+    cells = F.avg_pool2d(weight[:, None], 2)
+    flow_cells = F.avg_pool2d(target.flow.nan_to_num() * weight[:, None], 2) / cells.clamp_min(1e-6)
+    total_cells = cells.sum().clamp_min(1.0)
+    sequence = torch.zeros(())
+    for k, flow in enumerate(flows):
+        error = (flow - flow_cells).abs().sum(1, keepdim=True)
+        sequence = sequence + config.gamma ** (len(flows) - 1 - k) * (error * cells).sum() / total_cells
+
+    total = weight.sum().clamp_min(1.0)
+    error = (prediction.flow - target.flow).abs().sum(1)
+    likelihood = ((error * torch.exp(-prediction.log_scale) + 2 * prediction.log_scale) * weight).sum() / total
+    judged = near.float()
+    visibility = F.binary_cross_entropy_with_logits(prediction.visibility, target.visible.float(), judged)
+    visibility = visibility * judged.numel() / judged.sum().clamp_min(1.0)
+
+    kept = (~target.lost).float()
+    count = kept.sum().clamp_min(1.0)
+    quat = prediction.quat_wxyz
+    rotation = (((quat - target.quat_wxyz) / heads.quat_std).abs().mean(1) * kept).sum() / count
+    translation = (((prediction.v - target.v) / heads.v_std).abs().mean(1) * kept).sum() / count
+    angle = (compressed_angle - compress_angle(target.angle)).abs().mean()
+    loss = (
+        config.flow * sequence
+        + config.likelihood * likelihood
+        + config.visibility * visibility
+        + config.rotation * rotation
+        + config.translation * translation
+        + config.angle * angle
+    )
+    seen = (near & target.visible).float()
+    epe = ((prediction.flow - target.flow).detach().norm(dim=1) * seen).sum() / seen.sum().clamp_min(1.0)
+    parts = {"epe_px": epe, "likelihood": likelihood, "visibility": visibility, "rotation": rotation,
+             "translation": translation, "angle": angle}  # fmt: skip
+    return loss, {name: float(value.detach()) for name, value in parts.items()}

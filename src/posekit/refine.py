@@ -1,0 +1,161 @@
+"""The loop: zoom, render, predict, update; it keeps a trace. Layer 3.
+
+Paper, section 3.3: the pose is updated until SV-Net's own predicted angle falls below 2 degrees; where that does not
+happen within 50 iterations, the iterate with the lowest predicted angle wins. DeepIM's fixed number of iterations
+is the other policy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from posekit.errors import ConfigError
+from posekit.geometry import Pose, rotation_angle
+from posekit.nets.pose_delta import apply_delta
+from posekit.nets.predictor import PairPrediction, Predictor
+from posekit.object_model import ObjectModel
+from posekit.pnp import solve_pnp
+from posekit.render import Renderer
+from posekit.results import Step
+from posekit.view import View
+from posekit.zoom import zoom_to_pose
+
+UPDATES = ("regression", "correspondence")
+STOPS = ("angle", "fixed")
+
+
+@dataclass(frozen=True)
+class RefineOptions:
+    """update: what moves the pose, the regressed delta or the correspondences through PnP.
+    stop: ``angle`` (the paper's policy) or ``fixed`` (DeepIM's). iterations: at most, or exactly.
+    stop_angle: radians. last_update: also apply the update predicted for the pose that ended the loop."""
+
+    update: str = "correspondence"
+    stop: str = "angle"
+    iterations: int = 50
+    stop_angle: float = float(np.deg2rad(2.0))
+    last_update: bool = True
+
+    def __post_init__(self) -> None:
+        if self.update not in UPDATES or self.stop not in STOPS:
+            raise ConfigError(f"update is one of {UPDATES} and stop one of {STOPS}, not {self.update!r}, {self.stop!r}.")
+        if self.iterations < 1 or not 0 < self.stop_angle <= np.pi:
+            raise ConfigError(
+                f"iterations must be at least 1 and the stop angle between 0 and 180 degrees, not {self.iterations} "
+                f"and {np.rad2deg(self.stop_angle):g}."
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Refinement:
+    """Where one starting pose led. angle: the predicted rotation error that the choice rests on, radians."""
+
+    T_cam_obj: Pose
+    angle: float
+    iterations: int
+    converged: bool
+    trace: tuple[Step, ...]
+
+
+def refine(
+    view: View,
+    model: ObjectModel,
+    starts: Sequence[Pose],
+    predictor: Predictor,
+    renderer: Renderer,
+    options: RefineOptions = RefineOptions(),
+) -> list[Refinement]:
+    """Refine every starting ``T_cam_obj`` against the same photograph, in one batch per iteration.
+
+    view: the photograph with its camera and, where known, the object's mask.
+    """
+    outline = model.outline - model.center
+    loops = [_Loop(start) for start in starts]
+    for _ in range(options.iterations):
+        active = [loop for loop in loops if not loop.done]
+        if not active:
+            break
+        poses = [loop.pose for loop in active]
+        predictions, observed, rendered = compare(view, model, outline, poses, predictor, renderer, options.update)
+        for loop, prediction, seen, drawn in zip(active, predictions, observed, rendered, strict=True):
+            updated = update_pose(loop.pose, model, prediction, seen, drawn, options.update)
+            loop.advance(prediction, updated, options)
+    return [loop.finish(options) for loop in loops]
+
+
+def compare(
+    view: View,
+    model: ObjectModel,
+    outline: NDArray[np.float64],
+    poses: Sequence[Pose],
+    predictor: Predictor,
+    renderer: Renderer,
+    update: str,
+) -> tuple[list[PairPrediction], list[View], list[View]]:
+    """Zoom to each pose, draw the object there, and let the predictor compare. poses: ``T_cam_obj``."""
+    zooms = [zoom_to_pose(view.camera, T @ model.T_obj_ctr, outline, predictor.size) for T in poses]
+    observed = [view.zoomed(zoom) for zoom in zooms]
+    turned = [Pose.rotation(zoom.R_view_cam) @ T for zoom, T in zip(zooms, poses, strict=True)]
+    rendered = renderer.render(model, turned, [z.camera for z in zooms], coords=update == "correspondence")
+    return predictor.predict(observed, rendered), observed, rendered
+
+
+def update_pose(
+    T_cam_obj: Pose, model: ObjectModel, prediction: PairPrediction, observed: View, rendered: View, update: str
+) -> Pose | None:
+    """The pose after one prediction; None where it gives none (too few correspondences, behind the camera)."""
+    T_view_cam = Pose.rotation(observed.R_view_cam)
+    source = T_view_cam @ T_cam_obj @ model.T_obj_ctr
+    if update == "regression":
+        target: Pose | None = apply_delta(source, prediction.delta, rendered.camera.fx)
+    else:
+        found = prediction.correspondences
+        if found is None:
+            raise ConfigError("this preset predicts no correspondences: use --update regression.")
+        assert rendered.coords is not None
+        points = rendered.coords[found.source[:, 1], found.source[:, 0]] - model.center
+        target = solve_pnp(points, found.target, found.visible, found.scale_px, rendered.camera, source)
+    if target is None or not np.isfinite(target.matrix).all() or target.t[2] < 0.6 * model.diameter:
+        return None
+    return T_view_cam.inverse() @ target @ model.T_obj_ctr.inverse()
+
+
+class _Loop:
+    """One hypothesis on its way."""
+
+    def __init__(self, start: Pose) -> None:
+        self.pose = start
+        self.steps: list[Step] = []
+        self.after: list[Pose] = []  # the pose that each step's prediction leads to
+        self.done = self.converged = False
+
+    def advance(self, prediction: PairPrediction, updated: Pose | None, options: RefineOptions) -> None:
+        self.steps.append(Step(self.pose, prediction.angle))
+        self.after.append(updated or self.pose)
+        if updated is None:
+            self.done = True
+            return
+        if options.stop == "angle" and prediction.angle < options.stop_angle:
+            self.done = self.converged = True
+            return
+        self.pose = updated
+
+    def finish(self, options: RefineOptions) -> Refinement:
+        if options.stop == "fixed":
+            best = len(self.steps) - 1
+            self.converged = self.steps[best].angle < options.stop_angle
+        elif self.converged:
+            best = len(self.steps) - 1
+        else:
+            best = int(np.argmin([step.angle for step in self.steps]))
+        pose = self.after[best] if options.last_update else self.steps[best].T_cam_obj
+        return Refinement(pose, self.steps[best].angle, len(self.steps), self.converged, tuple(self.steps))
+
+
+def pose_change(a: Pose, b: Pose) -> tuple[float, float]:
+    """Rotation in radians and translation in metres between two ``T_cam_obj``."""
+    return float(rotation_angle(a.R.T @ b.R)), float(np.linalg.norm(a.t - b.t))

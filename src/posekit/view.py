@@ -1,0 +1,57 @@
+"""View: a picture and its camera, never apart. Layer 1."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from posekit.camera import Camera, Zoom
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What a camera sees.
+
+    image: uint8 RGB (H, W, 3). camera: its Camera, of the same size.
+    mask: bool (H, W), the object's pixels. depth: float32 (H, W), metres along z, 0 = nothing.
+    coords: float32 (H, W, 3), object coordinates in metres, 0 = nothing.
+    R_view_cam: (3, 3), from the photograph's camera frame into this view's (identity unless zoomed).
+    """
+
+    image: NDArray[np.uint8]
+    camera: Camera
+    mask: NDArray[np.bool_] | None = None
+    depth: NDArray[np.float32] | None = None
+    coords: NDArray[np.float32] | None = None
+    R_view_cam: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
+
+    def __post_init__(self) -> None:
+        size = (self.camera.height, self.camera.width)
+        for name in ("image", "mask", "depth", "coords"):
+            array = getattr(self, name)
+            if array is not None and array.shape[:2] != size:
+                raise ValueError(f"View: {name} is {array.shape[:2]}, its camera {size} (height, width)")
+
+    def with_mask(self, mask: NDArray[np.bool_] | None) -> View:
+        return replace(self, mask=mask)
+
+    def zoomed(self, zoom: Zoom) -> View:
+        """The picture and the mask resampled into ``zoom.camera``; depth and coords are dropped.
+
+        Pixels from outside the photograph are black and not in the mask. Where the zoom shrinks the
+        picture it is smoothed first, so that small details do not alias.
+        """
+        size, H = zoom.camera.size, zoom.homography
+        image = self.image
+        shrink = self.camera.fx / zoom.camera.fx
+        if shrink > 1.5:
+            image = cv2.GaussianBlur(image, (0, 0), 0.4 * shrink)
+        image = cv2.warpPerspective(image, H, size, flags=cv2.INTER_LINEAR)
+        mask = None
+        if self.mask is not None:
+            soft = cv2.warpPerspective(self.mask.astype(np.float32), H, size, flags=cv2.INTER_LINEAR)
+            mask = soft > 0.5
+        return View(image, zoom.camera, mask, R_view_cam=zoom.R_view_cam @ self.R_view_cam)
