@@ -15,7 +15,7 @@ from posekit.results import Estimate
 from posekit.view import View
 from posekit.zoom import zoom_to_box
 
-_WIDTHS = (640, 1600)  # pixels of the overlay, whatever the photograph has
+_SIDES = (640, 1600)  # pixels, limits of the overlay's longer side, whatever the photograph's is
 _TILE = (320, 240)
 _ITERATIONS = 3  # tiles of the strip between the first and the final pose
 _CONTEXT = 1.3  # a tile shows this many boxes
@@ -33,7 +33,8 @@ def overlay(renderer: Renderer, model: ObjectModel, view: View, estimates: Seque
         picture = draw.box(picture, (x0, y0, x1, y1))
         picture = draw.contour(picture, drawn.mask)
         picture = draw.axes(picture, shown.camera, estimate.T_cam_obj, 0.6 * float(model.extents.max()), model.center)
-    strips = [strip(renderer, model, view, estimate, picture.shape[1]) for estimate in estimates]
+    width = max(_SIDES[0], picture.shape[1])
+    strips = [strip(renderer, model, view, estimate, width) for estimate in estimates]
     return draw.stack([picture, *strips])
 
 
@@ -66,9 +67,10 @@ def _given_box(estimate: Estimate) -> tuple[float, float, float, float]:
 
 
 def _display_size(view: View) -> View:
-    """The view without its mask, scaled so that its width suits a screen."""
-    width = int(np.clip(view.camera.width, *_WIDTHS))
-    if width == view.camera.width:
+    """The view without its mask, scaled to suit a screen."""
+    longer = max(view.camera.size)
+    scale = float(np.clip(longer, *_SIDES)) / longer
+    if scale == 1.0:
         return view.with_mask(None)
-    height = max(1, round(view.camera.height * width / view.camera.width))
-    return View(draw.fit(view.image, (width, height)), view.camera.resized(width, height))
+    size = (max(1, round(scale * view.camera.width)), max(1, round(scale * view.camera.height)))
+    return View(draw.fit(view.image, size), view.camera.resized(*size))

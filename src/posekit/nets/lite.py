@@ -183,6 +183,52 @@ class LiteSVNet(nn.Module):
         return Prediction(quat, v, expand_angle(angle), fine, log_scale, dense[:, 3]), flows, angle
 
 
+class LiteMVNet(nn.Module):
+    """MV-Net of the lite preset: SV-Net's tower, one branch's weights for all views, the paper's fused heads.
+
+    The observed crop passes the tower once; the views' features depend on the mesh alone and can be kept
+    (``encode``, then ``match``). A branch sees, for each cell of a view, where in the observed crop it
+    finds itself (the mean of the softmax over its correlations), how surely, and both features there.
+    """
+
+    def __init__(self, tower: Tower, config: LiteConfig = LiteConfig(), views: int = 6) -> None:
+        super().__init__()
+        self.tower, self.config, self.views = tower, config, views
+        self.sharpness = nn.Parameter(torch.tensor(10.0))
+        self.reduce = nn.Conv2d(2 * config.features + 4, 64, 1)
+        self.summary = Summary(64, config.size)
+        self.fc = nn.Linear(256 * views, 512)
+        self.heads = PoseHeads(512, with_angle=False)
+
+    def encode(self, pictures: Tensor) -> Tensor:
+        """(N, 4, H, W) -> features (N, C + 1, H/8, W/8): the tower's, and the mask pooled to cells."""
+        return torch.cat([self.tower(pictures).float(), F.avg_pool2d(pictures[:, 3:], CELL)], dim=1)
+
+    def match(self, observed: Tensor, views: Tensor) -> Prediction:
+        """observed: (B, C + 1, h, w) and views: (B, M, C + 1, h, w) as ``encode`` gives them."""
+        B, M, _, h, w = views.shape
+        near = observed[:, None].expand(B, M, *observed.shape[1:]).flatten(0, 1)
+        quat, v, _ = self.heads(F.relu(self.fc(self._branch(near, views.flatten(0, 1)).view(B, M * 256))))
+        return Prediction(quat, v)
+
+    def _branch(self, observed: Tensor, view: Tensor) -> Tensor:
+        """Two (N, C + 1, h, w) -> (N, 256)."""
+        h, w = view.shape[-2:]
+        a, b = F.normalize(view[:, :-1], dim=1).flatten(2), F.normalize(observed[:, :-1], dim=1).flatten(2)
+        likeness = torch.einsum("ncp,ncq->npq", a, b)
+        share = torch.softmax(self.sharpness * likeness, dim=2)
+        home = _grid(h, w, view).flatten(2)  # (1, 2, h * w)
+        place = torch.einsum("npq,xcq->ncp", share, home)
+        there = torch.einsum("npq,ncq->ncp", share, observed[:, :-1].flatten(2))
+        moved = (place - home) / w
+        found = torch.cat([moved, likeness.amax(2)[:, None], there, view.flatten(2)], dim=1)
+        return self.summary(F.relu(self.reduce(found.unflatten(2, (h, w)))))
+
+    def forward(self, observed: Tensor, views: Tensor) -> Prediction:
+        """observed: (B, 4, H, W); views: (B, M, 4, H, W), the frontal one first."""
+        return self.match(self.encode(observed), self.encode(views.flatten(0, 1)).unflatten(0, views.shape[:2]))
+
+
 def _grid(h: int, w: int, like: Tensor) -> Tensor:
     ys, xs = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
     return torch.stack([xs, ys]).to(device=like.device, dtype=torch.float32)[None]

@@ -18,10 +18,11 @@ from torch import Tensor, nn
 
 from posekit.errors import WeightsError
 from posekit.files import write_bytes_atomic, write_text_atomic
-from posekit.nets.lite import LiteConfig, LiteSVNet
+from posekit.nets.lite import LiteConfig, LiteMVNet, LiteSVNet
 from posekit.nets.paper import Branch, PaperMVNet, PaperSVNet
 
 PRESETS = ("lite", "paper")
+SHARED = ("branch.", "tower.")  # what MV-Net has from SV-Net
 SHIPPED = Path(__file__).resolve().parent.parent / "weights"
 
 
@@ -36,12 +37,12 @@ class PaperConfig:
 
 @dataclass(frozen=True, eq=False)
 class Networks:
-    """The networks of one preset. mvnet: None where the preset, or the weights, have none."""
+    """The networks of one preset, with shared weights. mvnet: None where the weights hold no trained one."""
 
     preset: str
     config: LiteConfig | PaperConfig
     svnet: LiteSVNet | PaperSVNet
-    mvnet: PaperMVNet | None
+    mvnet: LiteMVNet | PaperMVNet | None
     digest: str = "untrained"
     about: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -59,7 +60,8 @@ def build(preset: str, config: LiteConfig | PaperConfig | None = None) -> Networ
     """Untrained networks of a preset. Raises WeightsError for an unknown one."""
     if preset == "lite":
         lite = config if isinstance(config, LiteConfig) else LiteConfig()
-        return Networks(preset, lite, LiteSVNet(lite), None)
+        svnet = LiteSVNet(lite)
+        return Networks(preset, lite, svnet, LiteMVNet(svnet.tower, lite))
     if preset == "paper":
         paper = config if isinstance(config, PaperConfig) else PaperConfig()
         branch = Branch(paper.size, paper.width)
@@ -71,8 +73,8 @@ def save_networks(path: Path, networks: Networks, about: Mapping[str, Any]) -> s
     """Write ``path``.safetensors in fp16 and ``path``.toml; returns the weights' hash."""
     state = {f"svnet.{k}": _half(v) for k, v in networks.svnet.state_dict().items()}
     if networks.mvnet is not None:
-        shared = "branch."
-        state |= {f"mvnet.{k}": _half(v) for k, v in networks.mvnet.state_dict().items() if not k.startswith(shared)}
+        own = networks.mvnet.state_dict()
+        state |= {f"mvnet.{k}": _half(v) for k, v in own.items() if not k.startswith(SHARED)}
     data = save(state)
     digest = hashlib.sha256(data).hexdigest()[:16]
     config = {k: list(v) if isinstance(v, tuple) else v for k, v in dataclasses.asdict(networks.config).items()}
@@ -127,7 +129,7 @@ def load_networks(preset: str, path: Path | None = None) -> Networks:
     _load_strictly(networks.svnet, {k[6:]: v for k, v in state.items() if k.startswith("svnet.")}, file)
     if networks.mvnet is not None and has_mvnet:
         own = {k[6:]: v for k, v in state.items() if k.startswith("mvnet.")}
-        own |= {k: v for k, v in networks.svnet.state_dict().items() if k.startswith("branch.")}
+        own |= {k: v for k, v in networks.svnet.state_dict().items() if k.startswith(SHARED)}
         _load_strictly(networks.mvnet, own, file)
     networks.svnet.eval()
     mvnet = networks.mvnet if has_mvnet else None

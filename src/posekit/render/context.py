@@ -99,7 +99,9 @@ def _wanted(backend: str) -> str:
     """The caller's choice, else the environment's."""
     chosen = os.environ.get("POSEKIT_GL", "auto") if backend == "auto" else backend
     if chosen not in BACKENDS:
-        raise RenderError(f"unknown OpenGL backend {chosen!r} (POSEKIT_GL or backend=): use one of {', '.join(BACKENDS)}.")
+        raise RenderError(
+            f"unknown OpenGL backend {chosen!r} (POSEKIT_GL or backend=): use one of {', '.join(BACKENDS)}."
+        )
     return chosen
 
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from posekit.camera import Camera
 from posekit.geometry import Pose, cube_views, fibonacci_sphere, view_rotation
 from posekit.object_model import ObjectModel
-from posekit.render.renderer import Light, Renderer
+from posekit.render.light import Light
+from posekit.render.renderer import Renderer
 from posekit.view import View
 
 SIX_VIEWS = 6

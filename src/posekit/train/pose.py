@@ -156,8 +156,8 @@ class Trainer:
 
     def export(self, about: dict[str, object]) -> str:
         """The averaged weights as fp16 safetensors in the run's folder; returns their hash."""
-        networks = dataclasses.replace(self.networks, svnet=self.average.module)
-        return save_networks(self.run / "lite", networks, about)
+        networks = dataclasses.replace(self.networks, svnet=self.average.module, mvnet=None)
+        return save_networks(self.run / "lite", networks, about)  # this recipe trains no MV-Net
 
 
 def _part(state: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

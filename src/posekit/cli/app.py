@@ -1,0 +1,80 @@
+"""``posekit``: the commands, and how all of them fail.
+
+Commands import what they need when they run, so that ``posekit --help`` loads neither torch nor OpenGL.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from posekit._version import __version__
+from posekit.cli import demo, doctor, estimate, refine, render_views
+from posekit.errors import PosekitError
+
+INTERRUPTED = 130  # as shells count it: 128 + SIGINT
+
+
+class Commands(TyperGroup):
+    """Turns a PosekitError into one line on standard error and exit code 1, Ctrl-C into exit code 130."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            with warnings.catch_warnings():
+                warnings.showwarning = _show_warning
+                return super().invoke(ctx)
+        except PosekitError as error:
+            if ctx.params.get("debug"):
+                raise
+            _tell("error", str(error), typer.colors.RED)
+            raise typer.Exit(1) from error
+        except KeyboardInterrupt as error:
+            _tell("interrupted", "nothing more is written", typer.colors.RED)
+            raise typer.Exit(INTERRUPTED) from error
+
+
+def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
+    _tell("warning", str(message), typer.colors.YELLOW)
+
+
+def _tell(kind: str, text: str, colour: str) -> None:
+    line = " ".join(text.splitlines())
+    typer.echo(f"{typer.style(f'{kind}:', fg=colour, bold=True)} {line}", err=True)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"posekit {__version__}")
+        raise typer.Exit
+
+
+app = typer.Typer(
+    cls=Commands,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+@app.callback()
+def _options(
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """From a photograph and a CAD file to the object's 6D pose."""
+
+
+app.command("estimate")(estimate.estimate)
+app.command("refine")(refine.refine)
+app.command("render-views")(render_views.render_views)
+app.command("doctor")(doctor.doctor)
+app.command("demo")(demo.demo)
+
+
+def main() -> None:
+    app(prog_name="posekit")

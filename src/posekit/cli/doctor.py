@@ -1,0 +1,111 @@
+"""``posekit doctor``: what is here, and what to do about what is not."""
+
+from __future__ import annotations
+
+import platform
+import sys
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import typer
+
+from posekit._version import __version__
+from posekit.errors import RenderError, WeightsError
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report. state: ok, note (works, but could be better) or problem. todo: what to do about it."""
+
+    topic: str
+    text: str
+    state: str = "ok"
+    todo: str = ""
+
+
+_STYLES = {"ok": "green", "note": "yellow", "problem": "bold red"}
+
+
+def doctor() -> None:
+    """Check OpenGL, torch, OpenVINO and the weights; exit code 1 where something essential is missing."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    findings = examine()
+    table = Table.grid(padding=(0, 2))
+    for finding in findings:
+        text = Text(finding.text)
+        if finding.todo:
+            text.append(f"\n-> {finding.todo}", style="bold")
+        table.add_row(Text(finding.state, style=_STYLES[finding.state]), finding.topic, text)
+    console = Console()
+    console.print(table)
+    problems = sum(finding.state == "problem" for finding in findings)
+    if problems:
+        console.print(f"{problems} problem{'s' if problems > 1 else ''}: posekit cannot work here yet.", style="bold red")
+        raise typer.Exit(1)
+
+
+def examine() -> list[Finding]:
+    """All findings, in the report's order."""
+    system = f"posekit {__version__}, Python {platform.python_version()}, {platform.platform()}"
+    checks: list[Callable[[], list[Finding]]] = [_opengl, _torch, _openvino, _weights]
+    return [Finding("system", system), *(finding for check in checks for finding in check())]
+
+
+def _opengl() -> list[Finding]:
+    from posekit import render
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            info = render.info()
+        except RenderError as error:
+            return [Finding("OpenGL", str(error), "problem", "Install what the line above names.")]
+    text = f"{info['renderer']} ({info['vendor']}), OpenGL {info['version']}, through {info['backend']}"
+    found = [Finding("OpenGL", text)]
+    found += [Finding("OpenGL", str(warning.message), "note") for warning in caught]
+    return found
+
+
+def _torch() -> list[Finding]:
+    try:
+        import torch
+    except (ImportError, OSError) as error:
+        return [Finding("torch", f"cannot be imported: {error}", "problem", _reinstall("torch torchvision"))]
+    device = torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU"
+    return [Finding("torch", f"{torch.__version__}, {torch.get_num_threads()} threads, {device}")]
+
+
+def _openvino() -> list[Finding]:
+    try:
+        import openvino
+    except (ImportError, OSError) as error:
+        return [Finding("OpenVINO", f"cannot be imported: {error}", "problem", _reinstall("openvino"))]
+    return [Finding("OpenVINO", str(openvino.__version__).partition("-")[0])]
+
+
+def _weights() -> list[Finding]:
+    try:
+        from posekit.nets.weights import PRESETS, find_weights, load_networks
+    except (ImportError, OSError):
+        return []  # torch's own finding says why
+    found = []
+    for preset in PRESETS:
+        topic = f"weights {preset}"
+        try:
+            path, networks = find_weights(preset), load_networks(preset)
+        except WeightsError as error:
+            essential = preset == PRESETS[0]
+            todo = _reinstall("posekit") if essential else f"Train it, or use --preset {PRESETS[0]}."
+            found.append(Finding(topic, str(error), "problem" if essential else "note", todo))
+            continue
+        about = "; ".join(f"{key}: {value}" for key, value in networks.about.items())
+        found.append(Finding(topic, f"{path}\nhash {networks.digest}" + (f"\n{about}" if about else "")))
+    return found
+
+
+def _reinstall(packages: str) -> str:
+    return f"{sys.executable} -m pip install --force-reinstall {packages}"

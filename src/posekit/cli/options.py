@@ -1,0 +1,87 @@
+"""Arguments and options that several commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+Units = Literal["auto", "mm", "m"]
+Update = Literal["correspondence", "regression"]
+Stop = Literal["angle", "fixed"]
+MaskFrom = Literal["grabcut", "filled"]
+
+INPUT, LOOP, OUTPUT = "Input", "Refinement", "Output"
+
+ImageArgument = Annotated[Path, typer.Argument(help="The photograph.", show_default=False)]
+ModelOption = Annotated[
+    Path, typer.Option("--model", "-m", metavar="MESH", help="PLY, OBJ, GLB or STL.", rich_help_panel=INPUT)
+]
+UnitsOption = Annotated[
+    Units, typer.Option(help="Of the mesh; auto decides by its diameter and says so.", rich_help_panel=INPUT)
+]
+SymmetryOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="TEXT|FILE",
+        help="The mesh's symmetries, where no models_info.json lies beside it.",
+        rich_help_panel=INPUT,
+    ),
+]
+CameraOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="fx,fy,cx,cy|FILE",
+        help="Intrinsics in pixels, or a BOP or OpenCV file. Else EXIF, else a 60 degree field of view is assumed.",
+        rich_help_panel=INPUT,
+    ),
+]
+BoxOption = Annotated[
+    str | None,
+    typer.Option(metavar="x0,y0,x1,y1", help="Box round the object, pixels.", rich_help_panel=INPUT),
+]
+MaskOption = Annotated[
+    Path | None,
+    typer.Option(metavar="PNG", help="The object's mask, of the photograph's size.", rich_help_panel=INPUT),
+]
+MaskFromOption = Annotated[
+    MaskFrom, typer.Option(help="How a box becomes a mask.", rich_help_panel=INPUT)
+]
+
+PresetOption = Annotated[str, typer.Option(help="The networks: lite or paper.", rich_help_panel=LOOP)]
+WeightsOption = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Weights in place of the shipped ones.", rich_help_panel=LOOP),
+]
+UpdateOption = Annotated[Update, typer.Option(help="What moves the pose.", rich_help_panel=LOOP)]
+StopOption = Annotated[
+    Stop,
+    typer.Option(help="At a predicted angle (the paper), or after a fixed number (DeepIM).", rich_help_panel=LOOP),
+]
+IterationsOption = Annotated[
+    int, typer.Option(help="At most; with --stop fixed exactly.", rich_help_panel=LOOP)
+]
+StopAngleOption = Annotated[
+    float, typer.Option(metavar="DEGREES", help="Predicted angle that ends the loop.", rich_help_panel=LOOP)
+]
+SeedOption = Annotated[int, typer.Option(help="The same seed gives the same result.", rich_help_panel=LOOP)]
+ThreadsOption = Annotated[
+    int | None, typer.Option(min=1, help="Threads of torch; by default its own choice.", rich_help_panel=LOOP)
+]
+
+OutOption = Annotated[
+    Path | None,
+    typer.Option(metavar="DIR", help="Folder for the results; it must be new or empty.", rich_help_panel=OUTPUT),
+]
+ForceOption = Annotated[
+    bool, typer.Option("--force", help="Write into a folder that holds files already.", rich_help_panel=OUTPUT)
+]
+JsonOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE|-",
+        help="Write the result there, - for standard output; then a folder is written only with --out.",
+        rich_help_panel=OUTPUT,
+    ),
+]

@@ -1,0 +1,102 @@
+"""Where results go: a folder, a JSON file, standard output."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import typer
+
+from posekit.errors import OutputError
+from posekit.files import write_bytes_atomic, write_text_atomic
+from posekit.results import Estimate
+
+
+@dataclass(frozen=True)
+class OutputFolder:
+    """A folder that is made when the first file is written.
+
+    Raises OutputError where it is a file, or holds files already and ``force`` is not given.
+    """
+
+    path: Path
+    force: bool = False
+
+    def __post_init__(self) -> None:
+        try:
+            occupied = self.path.is_dir() and any(self.path.iterdir())
+        except OSError as error:
+            raise OutputError(f"the output folder {self.path} cannot be read: {error.strerror}.") from error
+        if self.path.exists() and not self.path.is_dir():
+            raise OutputError(f"{self.path} is a file: --out names a folder.")
+        if occupied and not self.force:
+            raise OutputError(f"the folder {self.path} holds files: pass --force to write into it, or another --out.")
+
+    def write(self, name: str, data: bytes | str) -> Path:
+        """Write one file, whole or not at all, and return its path."""
+        path = self.path / name
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"the folder {self.path} cannot be made: {error.strerror}.") from error
+        if isinstance(data, str):
+            write_text_atomic(path, data)
+        else:
+            write_bytes_atomic(path, data)
+        return path
+
+
+@dataclass(frozen=True)
+class Destination:
+    """What ``--out``, ``--force`` and ``--json`` ask for, checked before any work is done.
+
+    json: None, "-" or a file. With ``--json`` and no ``--out`` no folder is written.
+    """
+
+    folder: OutputFolder | None
+    json: str | None
+
+    @classmethod
+    def chosen(cls, out: Path | None, default: Path, force: bool, json: str | None) -> Destination:
+        if json is not None and json != "-" and Path(json).is_dir():
+            raise OutputError(f"--json {json} is a folder: give a file, or - for standard output.")
+        if out is None and json is not None:
+            return cls(None, json)
+        return cls(OutputFolder(out or default, force), json)
+
+    def say(self, text: str) -> None:
+        """Tell the person something; on standard error where standard output is for JSON."""
+        typer.echo(text, err=self.json == "-")
+
+    def write(self, result: str, overlay: bytes | None) -> None:
+        """Write the result (JSON text) and the overlay (PNG) to wherever they were asked for."""
+        if self.folder is not None:
+            if overlay is not None:
+                self.say(f"overlay: {self.folder.write('overlay.png', overlay)}")
+            self.say(f"result:  {self.folder.write('result.json', result)}")
+        if self.json == "-":
+            sys.stdout.write(result)
+        elif self.json is not None:
+            write_text_atomic(Path(self.json), result)
+            self.say(f"result:  {self.json}")
+
+
+def describe(estimates: Sequence[Estimate]) -> str:
+    """The estimates for a person, some lines each."""
+    return "\n".join(_describe(estimate) for estimate in estimates)
+
+
+def _describe(estimate: Estimate) -> str:
+    pose = estimate.T_cam_obj
+    rows = "\n".join("    " + " ".join(f"{value:9.5f}" for value in row) for row in pose.matrix)
+    state = "converged" if estimate.converged else "not converged"
+    steps = f"{estimate.iterations} iteration{'' if estimate.iterations == 1 else 's'}"
+    seconds = estimate.timings.get("total", 0.0)
+    return (
+        f"{estimate.model}: T_cam_obj (metres)\n{rows}\n"
+        f"    predicted error {np.rad2deg(estimate.angle):.1f} degrees, {state} after {steps}, "
+        f"score {estimate.score:.2f}, {seconds:.1f} s"
+    )

@@ -1,0 +1,64 @@
+"""``posekit render-views``: a mesh from all sides."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from posekit.cli.options import ForceOption, ModelOption, UnitsOption
+from posekit.errors import ConfigError
+
+_BATCH = 16  # views in memory at a time
+_MOST_VIEWS = 10_000
+_LONGEST_SIDE = 4096
+_THUMBNAIL = 240  # pixels, longer side of a picture in the contact sheet
+
+
+def render_views(
+    model: ModelOption,
+    views: Annotated[int, typer.Option(help="6: the faces of a cube; else evenly over the sphere.")] = 6,
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="By default posekit-out/MESH-views; it must be new or empty.")
+    ] = None,
+    size: Annotated[str, typer.Option(metavar="WxH", help="Of each view, pixels.")] = "640x480",
+    units: UnitsOption = "auto",
+    force: ForceOption = False,
+) -> None:
+    """Render a mesh from all sides: RGB, masks and a contact sheet."""
+    shape = _parse_size(size)
+    if not 1 <= views <= _MOST_VIEWS:
+        raise ConfigError(f"--views {views}: from 1 to {_MOST_VIEWS} can be drawn.")
+
+    from posekit import draw
+    from posekit.cli.output import OutputFolder
+    from posekit.object_model import ObjectModel
+    from posekit.render import Renderer, render_views, view_rotations
+
+    folder = OutputFolder(out or Path("posekit-out") / f"{model.stem}-views", force)
+    mesh = ObjectModel.load(model, units=units)
+    renderer = Renderer(samples=4)
+    rotations, thumbnails = view_rotations(views), []
+    for start in range(0, views, _BATCH):
+        drawn = render_views(renderer, mesh, rotations[start : start + _BATCH], shape, coords=False)
+        for k, view in enumerate(drawn, start):
+            assert view.mask is not None
+            folder.write(f"{k:04d}.png", draw.png(view.image))
+            folder.write(f"{k:04d}_mask.png", draw.png(view.mask))
+            thumbnails.append(draw.fit(view.image, _thumbnail_size(shape)))
+    sheet = draw.grid(thumbnails, captions=[str(k) for k in range(views)])
+    typer.echo(f"{views} views and {folder.write('contact_sheet.png', draw.png(sheet))}")
+
+
+def _parse_size(text: str) -> tuple[int, int]:
+    """(width, height) from "640x480". Raises ConfigError."""
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(part.isdecimal() and 1 <= int(part) <= _LONGEST_SIDE for part in parts):
+        raise ConfigError(f"--size {text}: give WIDTHxHEIGHT in pixels, each from 1 to {_LONGEST_SIDE}, as 640x480.")
+    return int(parts[0]), int(parts[1])
+
+
+def _thumbnail_size(size: tuple[int, int]) -> tuple[int, int]:
+    scale = min(1.0, _THUMBNAIL / max(size))
+    return max(1, round(scale * size[0])), max(1, round(scale * size[1]))

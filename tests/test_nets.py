@@ -1,0 +1,263 @@
+"""Networks: shapes, statistics, losses and their gradients, weights on disk, one batch over-fitted."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from posekit.errors import WeightsError
+from posekit.nets.flownet import LAYERS, FlowNetEncoder
+from posekit.nets.heads import PoseHeads, Prediction, compress_angle, expand_angle
+from posekit.nets.inputs import images_to_tensor, to_input
+from posekit.nets.lite import Correlation, LiteConfig, LiteMVNet, LiteSVNet
+from posekit.nets.losses import Target, dense_loss, mvnet_loss, svnet_loss
+from posekit.nets.paper import Branch, PaperMVNet, PaperSVNet
+from posekit.nets.weights import PaperConfig, build, find_weights, load_networks, save_networks
+
+SMALL = LiteConfig(size=(64, 48), widths=(8, 16, 16), features=16, hidden=16, context=16, radius=2, updates=2)
+TINY_PAPER = PaperConfig(size=(128, 96), width=0.125)
+
+
+def pictures(count: int, size: tuple[int, int], seed: int = 0) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(count, 4, size[1], size[0], generator=generator) - 0.5
+
+
+def test_the_paper_preset_has_the_papers_layers() -> None:
+    branch = Branch((640, 480), 1.0)
+    svnet, mvnet = PaperSVNet(branch), PaperMVNet(branch)
+    assert svnet.branch is mvnet.branch, "the branch is shared"
+    convolutions = sum(p.numel() for p in branch.encoder.parameters())
+    assert 24.0e6 < convolutions < 24.4e6  # FlowNetS's ten layers on 8 channels (24.1 M)
+    assert branch.fc.in_features == 8 * 10 * 1024 and branch.fc.out_features == 256
+    assert (mvnet.fc.in_features, mvnet.fc.out_features) == (6 * 256, 512)
+    assert (svnet.fc.in_features, svnet.fc.out_features) == (256, 256)
+    assert mvnet.heads.angle is None and svnet.heads.angle is not None
+    with torch.inference_mode():
+        out = svnet(pictures(1, (640, 480)), pictures(1, (640, 480), 1))
+    assert out.quat_wxyz.shape == (1, 4) and out.v.shape == (1, 3) and out.angle is not None
+
+
+def test_the_paper_networks_at_reduced_size() -> None:
+    networks = build("paper", TINY_PAPER)
+    assert isinstance(networks.svnet, PaperSVNet) and networks.mvnet is not None
+    observed, views = pictures(2, TINY_PAPER.size), pictures(12, TINY_PAPER.size).view(2, 6, 4, 96, 128)
+    out = networks.mvnet(observed, views)
+    assert out.quat_wxyz.shape == (2, 4) and out.v.shape == (2, 3) and out.angle is None
+    first = networks.svnet(observed, views[:, 0])
+    assert first.angle is not None and first.angle.shape == (2,)
+    torch.testing.assert_close(first.quat_wxyz, torch.tensor([[1.0, 0, 0, 0]]).expand(2, 4), atol=0.2, rtol=0)
+    assert torch.count_nonzero(first.v) == 0, "DeepIM starts the translation at zero"
+
+
+def flownets_state(channels: int = 6) -> dict[str, torch.Tensor]:
+    state, last = {}, channels
+    for k, (name, kernel, _, out) in enumerate(LAYERS):
+        state[f"{name}.0.weight"] = torch.full((out, last, kernel, kernel), 0.01 * (k + 1))
+        state[f"{name}.0.bias"] = torch.full((out,), 0.5)
+        last = out
+    return state
+
+
+def test_a_flownets_checkpoint_loads_with_zero_mask_channels() -> None:
+    encoder = FlowNetEncoder()
+    encoder.load_flownets(flownets_state())
+    first = encoder.get_submodule("conv1")
+    assert isinstance(first, torch.nn.Conv2d)
+    assert torch.all(first.weight[:, :6] == 0.01) and torch.all(first.weight[:, 6:] == 0)
+    last = encoder.get_submodule("conv6_1")
+    assert isinstance(last, torch.nn.Conv2d) and torch.all(last.weight == 0.1)
+
+
+def test_a_foreign_checkpoint_is_refused() -> None:
+    state = flownets_state()
+    del state["conv3.0.weight"]
+    with pytest.raises(WeightsError, match=r"conv3\.weight"):
+        FlowNetEncoder().load_flownets(state)
+    with pytest.raises(WeightsError, match="full-width"):
+        FlowNetEncoder(0.5).load_flownets(flownets_state())
+    state = flownets_state()
+    del state["conv1.0.bias"]
+    with pytest.raises(WeightsError, match="FlowNetS_BN"):
+        FlowNetEncoder().load_flownets(state)
+
+
+def test_lite_answers_on_its_anchors() -> None:
+    net = LiteSVNet(SMALL).eval()
+    prediction, flows, angle = net.predict(pictures(3, SMALL.size), pictures(3, SMALL.size, 1))
+    assert prediction.flow is not None and prediction.flow.shape == (3, 2, 12, 16)
+    assert prediction.log_scale is not None and prediction.log_scale.shape == (3, 12, 16)
+    assert prediction.visibility is not None and prediction.visibility.shape == (3, 12, 16)
+    assert [f.shape for f in flows] == [(3, 2, 6, 8)] * SMALL.updates and angle.shape == (3,)
+
+
+def test_the_lite_preset_is_small_and_answers_in_one_batch_as_alone() -> None:
+    net = LiteSVNet().eval()
+    assert sum(p.numel() for p in net.parameters()) < 4e6
+    observed, rendered = pictures(2, (160, 120)), pictures(2, (160, 120), 1)
+    with torch.inference_mode():
+        both, alone = net(observed, rendered), net(observed[1:], rendered[1:])
+    torch.testing.assert_close(both.flow[1:], alone.flow, atol=1e-3, rtol=1e-3)
+
+
+def test_lite_mvnet_keeps_the_views_features() -> None:
+    svnet = LiteSVNet(SMALL)
+    net = LiteMVNet(svnet.tower, SMALL).eval()
+    assert net.tower is svnet.tower, "the tower is shared"
+    observed, views = pictures(2, SMALL.size), pictures(6, SMALL.size, 1)
+    with torch.inference_mode():
+        whole = net(observed, views.expand(2, *views.shape))
+        kept = net.encode(views)
+        again = net.match(net.encode(observed), kept.expand(2, *kept.shape))
+    assert whole.quat_wxyz.shape == (2, 4) and whole.v.shape == (2, 3) and whole.angle is None
+    torch.testing.assert_close(whole.quat_wxyz, again.quat_wxyz)
+
+
+def test_weights_without_mvnet_load_without_it(tmp_path: Path) -> None:
+    networks = build("lite", SMALL)
+    save_networks(tmp_path / "lite", dataclasses.replace(networks, mvnet=None), {})
+    assert load_networks("lite", tmp_path).mvnet is None
+
+
+def test_correlation_finds_a_shifted_picture() -> None:
+    generator = torch.Generator().manual_seed(0)
+    rendered = torch.randn(1, 32, 12, 16, generator=generator)
+    observed = torch.roll(rendered, shifts=(1, 2), dims=(2, 3))  # down 1, right 2
+    ys, xs = torch.meshgrid(torch.arange(12.0), torch.arange(16.0), indexing="ij")
+    found = Correlation(rendered, observed, levels=1, radius=3).lookup(torch.stack([xs, ys])[None])
+    best = found[0, :, 4:8, 4:10].argmax(0)  # away from the sides; window rows are y, columns x
+    assert torch.all(best // 7 - 3 == 1) and torch.all(best % 7 - 3 == 2)
+
+
+def test_correlation_levels_look_at_the_same_place() -> None:
+    """A bump at an even cell must be central in both levels when looked up where it is."""
+    rendered, observed = torch.zeros(1, 1, 8, 8), torch.zeros(1, 1, 8, 8)
+    rendered[0, 0, 4, 4] = 1
+    observed[0, 0, 2:4, 4:6] = 1  # centre (4.5, 2.5): the centre of a cell of level 1
+    centre = torch.zeros(1, 2, 8, 8)
+    centre[:, 0], centre[:, 1] = 4.5, 2.5
+    found = Correlation(rendered, observed, levels=2, radius=1).lookup(centre)[0, :, 4, 4].view(2, 3, 3)
+    torch.testing.assert_close(found[0, 1, 1], torch.tensor(1.0))
+    torch.testing.assert_close(found[1], torch.tensor([[0.0, 0, 0], [0, 1, 0], [0, 0, 0]]))
+
+
+def test_inputs_agree() -> None:
+    rng = np.random.default_rng(0)
+    image, mask = rng.integers(0, 256, (6, 8, 3)).astype(np.uint8), rng.random((6, 8)) > 0.5
+    tensor = images_to_tensor(torch.from_numpy(np.dstack([image, mask * np.uint8(255)]))[None])
+    np.testing.assert_allclose(tensor[0].numpy(), to_input(image, mask), atol=1e-6)
+    assert not to_input(image, None)[3].any()
+
+
+def test_the_angle_scale_is_its_own_inverse() -> None:
+    angle = torch.linspace(0, torch.pi, 50)
+    torch.testing.assert_close(expand_angle(compress_angle(angle)), angle)
+
+
+def test_statistics_make_the_answers_the_targets_mean() -> None:
+    heads = PoseHeads(8, with_angle=True)
+    quat = torch.nn.functional.normalize(torch.tensor([[1.0, 0.1, 0, 0], [1.0, -0.1, 0.2, 0]]), dim=1)
+    v = torch.tensor([[1.0, 2.0, 0.1], [3.0, 2.0, -0.1]])
+    heads.set_statistics(quat, v)
+    _, translation, angle = heads(torch.zeros(1, 8))
+    torch.testing.assert_close(translation[0], torch.tensor([2.0, 2.0, 0.0]))
+    assert angle is not None and angle.shape == (1,)
+
+
+def test_the_papers_losses_against_numbers_by_hand() -> None:
+    heads = PoseHeads(8, with_angle=True)
+    heads.v_std.copy_(torch.tensor([2.0, 2.0, 0.1]))
+    quat, v, angle = torch.tensor([[1.0, 0, 0, 0]]), torch.zeros(1, 3), torch.tensor([0.3])
+    guess = Prediction(torch.tensor([[0.0, 2.0, 0, 0]]), torch.tensor([[6.0, 8.0, 0.0]]), torch.tensor([0.1]))
+    # |1 - 0| + ||(3, 4, 0)|| + |1 - 2| (+ |0.3 - 0.1|)
+    assert float(svnet_loss(guess, heads, quat, v, angle)) == pytest.approx(1 + 5 + 1 + 0.2)
+    assert float(mvnet_loss(guess, heads, quat, v)) == pytest.approx((1 + 5 + 1) / 6)
+
+
+def random_target(count: int, config: LiteConfig) -> Target:
+    h, w = config.size[1] // 4, config.size[0] // 4
+    generator = torch.Generator().manual_seed(3)
+    quat = torch.nn.functional.normalize(
+        torch.tensor([1.0, 0, 0, 0]) + 0.1 * torch.randn(count, 4, generator=generator), dim=1
+    )
+    shift = 4 * torch.randn(count, 2, 1, 1, generator=generator)
+    lost = torch.zeros(count, dtype=torch.bool)
+    valid = torch.zeros(count, h, w, dtype=torch.bool)
+    valid[:, 3:-3, 3:-3] = True
+    return Target(shift.expand(count, 2, h, w).contiguous(), valid, valid.clone(), quat,
+                  torch.randn(count, 3, generator=generator), torch.rand(count, generator=generator), lost)  # fmt: skip
+
+
+def test_lost_pairs_teach_the_angle_alone() -> None:
+    net = LiteSVNet(SMALL)
+    target = random_target(2, SMALL)
+    target.lost[:] = True
+    prediction, flows, angle = net.predict(pictures(2, SMALL.size), pictures(2, SMALL.size, 1))
+    loss, parts = dense_loss(prediction, flows, angle, net.heads, target)
+    assert parts["rotation"] == parts["translation"] == parts["likelihood"] == 0
+    loss.backward()
+    assert net.heads.rotation.weight.grad is None or not net.heads.rotation.weight.grad.any()
+    assert net.heads.angle is not None and net.heads.angle.weight.grad is not None
+    assert net.heads.angle.weight.grad.any()
+
+
+def test_one_batch_is_over_fitted() -> None:
+    torch.manual_seed(0)
+    net = LiteSVNet(SMALL)
+    target = random_target(4, SMALL)
+    net.heads.set_statistics(target.quat_wxyz, target.v)
+    observed, rendered = pictures(4, SMALL.size), pictures(4, SMALL.size, 1)
+    optimiser = torch.optim.AdamW(net.parameters(), lr=3e-3)
+    found: list[dict[str, float]] = []
+    for _ in range(150):
+        prediction, flows, angle = net.predict(observed, rendered)
+        loss, parts = dense_loss(prediction, flows, angle, net.heads, target)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        found.append(parts)
+    assert found[-1]["epe_px"] < 0.25 * found[0]["epe_px"]
+    assert found[-1]["rotation"] < 0.3 * found[0]["rotation"]
+    assert found[-1]["angle"] < 0.3 * found[0]["angle"]
+
+
+@pytest.mark.parametrize("preset, config", [("lite", SMALL), ("paper", TINY_PAPER)])
+def test_weights_come_back_as_they_went(tmp_path: Path, preset: str, config: LiteConfig | PaperConfig) -> None:
+    networks = build(preset, config)
+    digest = save_networks(tmp_path / "mine", networks, {"trained_on": "nothing", "steps": 0})
+    for given in (tmp_path / "mine", tmp_path / "mine.safetensors", tmp_path / "mine.toml"):
+        loaded = load_networks(preset, given)
+        assert loaded.digest == digest and loaded.config == config and loaded.about["trained_on"] == "nothing"
+    for name, value in networks.svnet.state_dict().items():
+        half = value.half().float() if value.is_floating_point() else value
+        torch.testing.assert_close(loaded.svnet.state_dict()[name], half)
+    assert loaded.mvnet is not None
+    assert set(p.name for p in tmp_path.iterdir()) == {"mine.safetensors", "mine.toml"}
+    assert all(v.dtype != torch.float32 for v in load_file(tmp_path / "mine.safetensors").values())
+
+
+def test_bad_weights_are_refused(tmp_path: Path) -> None:
+    save_networks(tmp_path / "lite", build("lite", SMALL), {})
+    with pytest.raises(WeightsError, match="no weights at"):
+        load_networks("lite", tmp_path / "other")
+    with pytest.raises(WeightsError, match="preset 'lite', not 'paper'"):
+        load_networks("paper", tmp_path / "lite")
+    data = (tmp_path / "lite.safetensors").read_bytes()
+    (tmp_path / "lite.safetensors").write_bytes(data[: len(data) // 2])
+    with pytest.raises(WeightsError, match="damaged"):
+        load_networks("lite", tmp_path / "lite")
+    (tmp_path / "lite.safetensors").write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+    with pytest.raises(WeightsError, match="do not belong together"):
+        load_networks("lite", tmp_path / "lite")
+    (tmp_path / "lite.toml").unlink()
+    with pytest.raises(WeightsError, match=r"needs lite\.toml"):
+        load_networks("lite", tmp_path / "lite")
+    with pytest.raises(WeightsError, match="unknown preset"):
+        build("huge")
+    with pytest.raises(WeightsError, match="ships no trained weights"):
+        find_weights("paper")
