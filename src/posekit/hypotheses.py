@@ -64,7 +64,7 @@ def _patch(image: NDArray[np.uint8], mask: NDArray[np.uint8], size: int, turn: f
     points = cv2.findNonZero(mask)
     if points is None:
         return None
-    uv = points[:, 0].astype(np.float64)
+    uv = points.reshape(-1, 2).astype(np.float64)
     c, s = np.cos(turn), np.sin(turn)
     R = np.array([[c, -s], [s, c]])
     turned = uv @ R.T

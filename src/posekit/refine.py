@@ -72,7 +72,10 @@ def refine(
     """Refine every starting ``T_cam_obj`` against the same photograph, in one batch per iteration.
 
     view: the photograph with its camera and, where known, the object's mask.
+    Raises ConfigError where the update needs correspondences and the predictor gives none.
     """
+    if options.update == "correspondence" and not predictor.dense:
+        raise ConfigError("this preset predicts no correspondences: use --update regression.")
     outline = model.outline - model.center
     loops = [_Loop(start) for start in starts]
     for _ in range(options.iterations):
@@ -80,7 +83,7 @@ def refine(
         if not active:
             break
         poses = [loop.pose for loop in active]
-        predictions, observed, rendered = compare(view, model, outline, poses, predictor, renderer, options.update)
+        predictions, observed, rendered = compare(view, model, outline, poses, predictor, renderer)
         for loop, prediction, seen, drawn in zip(active, predictions, observed, rendered, strict=True):
             updated = update_pose(loop.pose, model, prediction, seen, drawn, options.update)
             loop.advance(prediction, updated, options)
@@ -94,13 +97,12 @@ def compare(
     poses: Sequence[Pose],
     predictor: Predictor,
     renderer: Renderer,
-    update: str,
 ) -> tuple[list[PairPrediction], list[View], list[View]]:
     """Zoom to each pose, draw the object there, and let the predictor compare. poses: ``T_cam_obj``."""
     zooms = [zoom_to_pose(view.camera, T @ model.T_obj_ctr, outline, predictor.size) for T in poses]
     observed = [view.zoomed(zoom) for zoom in zooms]
     turned = [Pose.rotation(zoom.R_view_cam) @ T for zoom, T in zip(zooms, poses, strict=True)]
-    rendered = renderer.render(model, turned, [z.camera for z in zooms], coords=update == "correspondence")
+    rendered = renderer.render(model, turned, [z.camera for z in zooms], coords=predictor.dense)
     return predictor.predict(observed, rendered), observed, rendered
 
 
@@ -114,9 +116,7 @@ def update_pose(
         target: Pose | None = apply_delta(source, prediction.delta, rendered.camera.fx)
     else:
         found = prediction.correspondences
-        if found is None:
-            raise ConfigError("this preset predicts no correspondences: use --update regression.")
-        assert rendered.coords is not None
+        assert found is not None and rendered.coords is not None
         points = rendered.coords[found.source[:, 1], found.source[:, 0]] - model.center
         target = solve_pnp(points, found.target, found.visible, found.scale_px, rendered.camera, source)
     if target is None or not np.isfinite(target.matrix).all() or target.t[2] < 0.6 * model.diameter:

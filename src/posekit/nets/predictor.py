@@ -43,9 +43,13 @@ class PairPrediction:
 
 
 class Predictor(Protocol):
-    """Anything that compares an observed with a rendered view of the same zoomed camera."""
+    """Anything that compares an observed with a rendered view of the same zoomed camera.
+
+    size: (width, height) of the views it takes. dense: whether it gives correspondences.
+    """
 
     size: tuple[int, int]
+    dense: bool
 
     def predict(self, observed: Sequence[View], rendered: Sequence[View]) -> list[PairPrediction]: ...
 
@@ -56,6 +60,7 @@ class NetworkPredictor:
     def __init__(self, networks: Networks) -> None:
         self.networks = networks
         self.size = networks.size
+        self.dense = networks.dense
 
     def predict(self, observed: Sequence[View], rendered: Sequence[View]) -> list[PairPrediction]:
         first = torch.from_numpy(np.stack([to_input(v.image, v.mask) for v in observed]))

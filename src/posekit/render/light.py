@@ -32,3 +32,6 @@ class Light:
     def flat(cls) -> Light:
         """Colours as they are in the mesh."""
         return cls(ambient=1.0, diffuse=0.0, specular=0.0)
+
+
+DEFAULT_LIGHT = Light()

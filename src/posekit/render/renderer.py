@@ -18,12 +18,11 @@ from posekit.geometry import Pose
 from posekit.object_model import ObjectModel
 from posekit.render import context
 from posekit.render.gpu import Draw, Mesh, Pass, Program, Target
-from posekit.render.light import Light
+from posekit.render.light import DEFAULT_LIGHT, Light
 from posekit.view import View
 
 SAMPLES = (0, 2, 4, 8)
 _TARGETS = 4  # sizes of pictures whose framebuffers are kept
-_DEFAULT_LIGHT = Light()
 
 
 class Renderer:
@@ -53,7 +52,7 @@ class Renderer:
         poses: Sequence[Pose],
         cameras: Sequence[Camera] | Camera,
         *,
-        light: Light | Sequence[Light] | None = _DEFAULT_LIGHT,
+        light: Light | Sequence[Light] | None = DEFAULT_LIGHT,
         rgb: bool = True,
         coords: bool = True,
     ) -> list[View]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from posekit.camera import Camera
 from posekit.geometry import Pose, cube_views, fibonacci_sphere, view_rotation
 from posekit.object_model import ObjectModel
-from posekit.render.light import Light
+from posekit.render.light import DEFAULT_LIGHT, Light
 from posekit.render.renderer import Renderer
 from posekit.view import View
 
@@ -52,7 +52,7 @@ def render_views(
     size: tuple[int, int],
     *,
     fov: float = DEFAULT_FOV,
-    light: Light | Sequence[Light] | None = Light(),
+    light: Light | Sequence[Light] | None = DEFAULT_LIGHT,
     rgb: bool = True,
     coords: bool = True,
 ) -> list[View]:

@@ -1,0 +1,116 @@
+"""Pictures for people: right place, right colours, inputs untouched."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from posekit import draw
+from posekit.camera import Camera
+from posekit.geometry import Pose
+
+CAMERA = Camera(500.0, 500.0, 79.5, 59.5, 160, 120)
+
+
+@pytest.fixture
+def image() -> draw.Image:
+    return np.full((120, 160, 3), 90, dtype=np.uint8)
+
+
+def test_contour_follows_the_mask_and_leaves_its_inside(image: draw.Image) -> None:
+    mask = np.zeros((120, 160), dtype=np.bool_)
+    mask[30:90, 40:120] = True
+    mask[50:70, 60:100] = False  # a hole has a contour too
+    drawn = draw.contour(image, mask, (0, 255, 0))
+    assert (image == 90).all()
+    for row, column in [(30, 80), (89, 80), (60, 40), (60, 119), (60, 59)]:
+        red, green, blue = drawn[row, column]
+        assert green > 180
+        assert max(red, blue) < 60
+    for row, column in [(40, 50), (60, 80), (10, 10)]:
+        assert tuple(drawn[row, column]) == (90, 90, 90)
+
+
+def test_contour_of_nothing_changes_nothing(image: draw.Image) -> None:
+    assert (draw.contour(image, np.zeros((120, 160), dtype=np.bool_)) == image).all()
+
+
+def test_axes_point_where_the_camera_sees_them(image: draw.Image) -> None:
+    drawn = draw.axes(image, CAMERA, Pose.translation([0, 0, 1.0]), 0.08)
+    assert tuple(drawn[60, 100]) == draw.AXES[0]  # x to the right
+    assert tuple(drawn[85, 80]) == draw.AXES[1]  # y down
+    assert (image == 90).all()
+
+
+def test_axes_behind_the_camera_are_left_out(image: draw.Image) -> None:
+    assert (draw.axes(image, CAMERA, Pose.translation([0, 0, -1.0]), 0.1) == image).all()
+    close = draw.axes(image, CAMERA, Pose.translation([0, 0, 1e-6]), 0.1)  # projects far outside
+    assert close.shape == image.shape
+
+
+def test_box_lies_on_the_outermost_pixels(image: draw.Image) -> None:
+    drawn = draw.box(image, (10, 20, 30, 50), (255, 0, 0))
+    red = (drawn == (255, 0, 0)).all(axis=-1)
+    rows, columns = np.flatnonzero(red.any(axis=1)), np.flatnonzero(red.any(axis=0))
+    assert (rows[0], rows[-1], columns[0], columns[-1]) == (20, 49, 10, 29)
+    assert not red[30, 20]
+
+
+@pytest.mark.parametrize("width", [16, 160, 1600])
+def test_caption_fits_any_width(width: int) -> None:
+    picture = np.full((width, width, 3), 200, dtype=np.uint8)
+    drawn = draw.caption(picture, "a rather long caption with 12.3 deg")
+    assert drawn.shape == picture.shape
+    assert (drawn[width // 2 :] == 200).all()
+    assert (drawn != picture).any()
+
+
+def test_grid_places_pictures_row_by_row() -> None:
+    pictures = [np.full((10, 20, 3), 50 * k, dtype=np.uint8) for k in range(1, 5)]
+    sheet = draw.grid(pictures, columns=3, gap=2)
+    assert sheet.shape == (22, 64, 3)
+    assert [int(sheet[5, x, 0]) for x in (10, 32, 54)] == [50, 100, 150]
+    assert int(sheet[17, 10, 0]) == 200
+    assert tuple(sheet[17, 40]) == draw.PAPER
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 6, 200])
+def test_grid_is_about_square(count: int) -> None:
+    sheet = draw.grid([np.zeros((30, 40, 3), dtype=np.uint8)] * count)
+    assert sheet.shape[0] * sheet.shape[1] >= count * 1200
+    assert count < 6 or 0.5 < sheet.shape[1] / sheet.shape[0] < 3
+
+
+def test_grid_refuses_other_sizes() -> None:
+    with pytest.raises(ValueError, match="one size"):
+        draw.grid([np.zeros((3, 4, 3), np.uint8), np.zeros((4, 4, 3), np.uint8)])
+    with pytest.raises(ValueError, match="one size"):
+        draw.grid([])
+
+
+@pytest.mark.parametrize("count", [1, 3, 6])
+def test_strip_has_the_width_asked_for(count: int, image: draw.Image) -> None:
+    row = draw.strip([image] * count, [f"step {k}" for k in range(count)], 641)
+    assert row.shape[1] == 641
+    assert row.shape[0] == pytest.approx(641 / count * 0.75, abs=4)
+
+
+def test_stack_keeps_every_picture() -> None:
+    sheet = draw.stack([np.full((5, 8, 3), 10, np.uint8), np.full((3, 4, 3), 20, np.uint8)], gap=1)
+    assert sheet.shape == (9, 8, 3)
+    assert (sheet[:5] == 10).all()
+    assert (sheet[6:, :4] == 20).all()
+    assert tuple(sheet[7, 6]) == draw.PAPER
+
+
+def test_png_keeps_colours_and_masks() -> None:
+    rng = np.random.default_rng(0)
+    picture = rng.integers(0, 256, (7, 9, 3), dtype=np.uint8)
+    decoded = cv2.imdecode(np.frombuffer(draw.png(picture), np.uint8), cv2.IMREAD_COLOR)
+    assert (decoded[..., ::-1] == picture).all()
+    mask = picture[..., 0] > 100
+    decoded = cv2.imdecode(np.frombuffer(draw.png(mask), np.uint8), cv2.IMREAD_UNCHANGED)
+    assert decoded.shape == (7, 9)
+    assert ((decoded == 255) == mask).all()
+    assert set(np.unique(decoded)) <= {0, 255}

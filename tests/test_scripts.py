@@ -1,0 +1,97 @@
+"""The scripts: sound bash, and what does not need a network of what they promise."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+SCRIPTS = [ROOT / "scripts" / name for name in ("setup", "demo", "test", "check")] + [ROOT / ".ci" / "run"]
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.name)
+def test_script_is_sound_bash(script: Path) -> None:
+    text = script.read_text()
+    assert text.startswith("#!/usr/bin/env bash\n")
+    assert "set -euo pipefail" in text
+    assert os.access(script, os.X_OK), f"{script.name} must be executable"
+    subprocess.run(["bash", "-n", str(script)], check=True)
+
+
+@pytest.fixture
+def tree(tmp_path: Path) -> Path:
+    """A copy of what setup reads, in a folder with a space in its name."""
+    root = tmp_path / "a clone"
+    (root / "scripts").mkdir(parents=True)
+    for name in ("pyproject.toml", "scripts/setup", "scripts/constraints.txt"):
+        shutil.copy(ROOT / name, root / name)
+    return root
+
+
+def run(tree: Path, path: Path, cwd: Path) -> subprocess.CompletedProcess[str]:
+    env = {**os.environ, "PATH": f"{path}:/usr/bin:/bin"}
+    return subprocess.run(
+        [str(tree / "scripts/setup")], env=env, cwd=cwd, capture_output=True, text=True, timeout=120, check=False
+    )
+
+
+def fake_venv(tree: Path, pip: str) -> None:
+    """A .venv whose python runs everything but pip's install, in whose place ``pip`` (bash) runs."""
+    python = tree / ".venv/bin/python"
+    python.parent.mkdir(parents=True)
+    python.write_text(
+        f'#!/usr/bin/env bash\ncase "$*" in *"pip install"*) {pip} ;; *) exec {sys.executable} "$@" ;; esac\n'
+    )
+    python.chmod(0o755)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the scripts install system libraries on Linux")
+def test_setup_installs_once(tree: Path, tmp_path: Path) -> None:
+    fake_venv(tree, f'echo "$*" >> "{tmp_path}/calls"; echo Collecting everything')
+    first = run(tree, tmp_path, tmp_path)
+    assert first.returncode == 0, first.stderr
+    assert "log: .venv/setup.log" in first.stderr
+    assert "Collecting everything" not in first.stdout + first.stderr
+    assert "Collecting everything" in (tree / ".venv/setup.log").read_text()
+    second = run(tree, tmp_path, tmp_path)
+    assert (second.returncode, second.stdout, second.stderr) == (0, "", "")
+    calls = (tmp_path / "calls").read_text()
+    assert calls.count("\n") == 1
+    assert "-c scripts/constraints.txt" in calls
+    with (tree / "scripts/constraints.txt").open("a") as file:
+        file.write("# changed\n")
+    assert run(tree, tmp_path, tmp_path).returncode == 0
+    assert (tmp_path / "calls").read_text().count("\n") == 2
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the scripts install system libraries on Linux")
+def test_setup_shows_the_end_of_pips_log_when_pip_fails(tree: Path, tmp_path: Path) -> None:
+    fake_venv(tree, "echo ERROR: no space left; exit 3")
+    result = run(tree, tmp_path, tmp_path)
+    assert result.returncode == 1
+    assert "ERROR: no space left" in result.stderr
+    assert "pip install failed" in result.stderr
+    assert not (tree / ".venv/posekit-setup").exists()
+
+
+def test_setup_says_that_python_is_too_old(tree: Path, tmp_path: Path) -> None:
+    for name in ("python3", "python3.11", "python3.12", "python3.13", "python3.14"):
+        (tmp_path / name).write_text("#!/bin/sh\nexit 1\n")
+        (tmp_path / name).chmod(0o755)
+    result = run(tree, tmp_path, tmp_path)
+    assert result.returncode == 1
+    assert "Python 3.11 or newer" in result.stderr
+    assert not (tree / ".venv").exists()
+
+
+def test_constraints_lie_within_the_ranges() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    pinned = [line for line in (ROOT / "scripts/constraints.txt").read_text().splitlines() if "==" in line]
+    assert {line.split("==")[0] for line in pinned} == {"torch", "torchvision"}
+    assert not any("==" in dependency for dependency in project["dependencies"])
