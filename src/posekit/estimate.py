@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from posekit.camera import Box
-from posekit.errors import ConfigError, WeightsError
+from posekit.errors import ConfigError
 from posekit.geometry import Pose
-from posekit.hypotheses import Hypothesis, TemplateSearch
+from posekit.hypotheses import Hypothesis, MVNetSearch, TemplateSearch
 from posekit.nets.predictor import NetworkPredictor
 from posekit.nets.weights import load_networks
 from posekit.object_model import ObjectModel
@@ -71,13 +71,11 @@ class PoseEstimator:
         torch.manual_seed(options.seed)
         self.model, self.options = model, options
         self.networks = load_networks(preset, weights)
-        if options.init == "mvnet" and self.networks.mvnet is None:
-            raise WeightsError(
-                f"the {preset} weights {self.networks.digest} hold no trained MV-Net: use --init templates."
-            )
         self.predictor = NetworkPredictor(self.networks)
         self.renderer = Renderer()
-        self._search: TemplateSearch | None = None
+        self._search: TemplateSearch | MVNetSearch | None = None
+        if options.init == "mvnet":
+            self._search = MVNetSearch(model, self.networks, self.renderer)
 
     @property
     def weights_hash(self) -> str:

@@ -12,16 +12,30 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from posekit.camera import Camera, mask_box
-from posekit.errors import PromptError
-from posekit.geometry import Pose, fibonacci_sphere, rotation_angle, so3_exp, view_rotation
+from posekit.camera import Camera
+from posekit.errors import PromptError, WeightsError
+from posekit.geometry import (
+    Pose,
+    cube_views,
+    fibonacci_sphere,
+    quat_to_rotation,
+    rotation_angle,
+    rotation_between,
+    so3_exp,
+    view_rotation,
+)
+from posekit.nets.inputs import to_input
+from posekit.nets.lite import LiteMVNet
+from posekit.nets.pose_delta import PoseDelta, apply_delta
+from posekit.nets.weights import Networks
 from posekit.object_model import ObjectModel
 from posekit.render import Light, Renderer
 from posekit.results import Detection
 from posekit.view import View
-from posekit.zoom import zoom_to_box
+from posekit.zoom import zoom_to_box, zoom_to_pose
 
 Array = NDArray[np.float64]
 FArray = NDArray[np.float32]
@@ -156,16 +170,64 @@ class TemplateSearch:
         offset = (np.array([self.camera.cx, self.camera.cy]) - template.centre) / template.half * patch.half
         pixel = patch.centre + R_turn[:2, :2] @ offset
         T_view_ctr = Pose(R, crop.camera.backproject(pixel, depth))
-        ray_turn = rotation_to_ray(T_view_ctr.t)
+        ray_turn = rotation_between([0.0, 0.0, 1.0], T_view_ctr.t)
         T_view_ctr = Pose(ray_turn @ T_view_ctr.R, T_view_ctr.t)  # seen along this ray it looks as the template does
         return Pose.rotation(crop.R_view_cam.T) @ T_view_ctr @ self.model.T_obj_ctr.inverse()
 
 
-def rotation_to_ray(t: Array) -> Array:
-    """The viewing-ray rotation (3, 3): turns what was seen on the optical axis to look the same along ``t`` (3,)."""
-    from posekit.geometry import rotation_between
+class MVNetSearch:
+    """The paper's first pose: MV-Net compares the crop with the six views of a cube's faces (section 3.2).
 
-    return rotation_between([0.0, 0.0, 1.0], t)
+    The views are rendered once per mesh, each as a crop round its own box would show it. The answer is relative to
+    the frontal view, placed at the detection box's centre, at the depth at which it looks as large in the crop as it
+    was rendered: so the box's size gives the first depth.
+    """
+
+    def __init__(self, model: ObjectModel, networks: Networks, renderer: Renderer) -> None:
+        if networks.mvnet is None:
+            raise WeightsError(
+                f"the {networks.preset} weights {networks.digest} hold no trained MV-Net: use --init templates."
+            )
+        self.model, self.size, self.mvnet = model, networks.size, networks.mvnet
+        self.rotations = cube_views()
+        self.camera, self.distance = frontal_camera(model, networks.size)
+        poses = [Pose(R, np.array([0, 0, self.distance])) @ model.T_obj_ctr.inverse() for R in self.rotations]
+        views = renderer.render(model, poses, self.camera, coords=False)
+        self.views = torch.from_numpy(np.stack([to_input(v.image, v.mask) for v in views]))
+        with torch.inference_mode():
+            self.kept = self.mvnet.encode(self.views) if isinstance(self.mvnet, LiteMVNet) else None
+
+    def search(self, view: View, detection: Detection, count: int) -> list[Hypothesis]:
+        """One first pose; ``count`` is an upper bound, as for every search. Empty where it lies behind the camera."""
+        mask = detection.mask if detection.mask is not None else box_mask(detection.box, view.camera)
+        crop = view.with_mask(mask).zoomed(zoom_to_box(view.camera, detection.box, self.size))
+        observed = torch.from_numpy(to_input(crop.image, crop.mask))[None]
+        with torch.inference_mode():
+            if isinstance(self.mvnet, LiteMVNet) and self.kept is not None:
+                out = self.mvnet.match(self.mvnet.encode(observed), self.kept[None])
+            else:
+                out = self.mvnet(observed, self.views[None])
+        delta = PoseDelta(quat_to_rotation(out.quat_wxyz[0].double().numpy()), out.v[0].double().numpy())
+        target = apply_delta(self.frontal(crop.camera), delta, crop.camera.fx)
+        if not np.isfinite(target.matrix).all() or target.t[2] < 0.6 * self.model.diameter:
+            return []
+        T_cam_view = Pose.rotation(crop.R_view_cam.T)
+        return [Hypothesis(T_cam_view @ target @ self.model.T_obj_ctr.inverse(), 1.0)][:count]
+
+    def frontal(self, crop_camera: Camera) -> Pose:
+        """The ``T_view_ctr`` to which MV-Net's answer is relative."""
+        return Pose(self.rotations[0], np.array([0, 0, self.distance * crop_camera.fx / self.camera.fx]))
+
+
+def frontal_camera(model: ObjectModel, size: tuple[int, int]) -> tuple[Camera, float]:
+    """The camera of MV-Net's views and the object's distance: a crop 4:3 round the frontal view's box.
+
+    size: (width, height) in pixels.
+    """
+    distance = 5.0 * model.diameter
+    frontal = Pose(cube_views()[0], np.array([0, 0, distance]))
+    whole = Camera.from_fov(1.0, *size)
+    return zoom_to_pose(whole, frontal, model.outline - model.center, size, enlarge=1.0).camera, distance
 
 
 def box_mask(box: tuple[float, float, float, float], camera: Camera) -> NDArray[np.bool_]:
@@ -180,5 +242,3 @@ def _u8(mask: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
     assert mask is not None
     return mask.astype(np.uint8)
 
-
-__all__ = ["Hypothesis", "TemplateOptions", "TemplateSearch", "box_mask", "mask_box"]

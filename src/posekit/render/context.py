@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from ctypes.util import find_library
 from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 
@@ -150,14 +151,14 @@ def _create_egl() -> moderngl.Context:
                 moderngl.create_context(standalone=True, backend="egl", device_index=index, **libraries)  # type: ignore[arg-type]
             )
         except Exception as error:  # moderngl and glcontext raise bare Exception
-            if failures and str(error) == failures[-1].partition(": ")[2]:
-                break
+            if index > 0 and (str(error) in failures[-1] or "requested device index" in str(error)):
+                break  # no further device
             failures.append(f"device {index}: {error}")
     raise RenderError(", ".join(failures))
 
 
 def _create_osmesa() -> moderngl.Context:
-    return _checked(moderngl.create_context(context=OsMesa()))
+    return _checked(moderngl.create_context(context=OsMesa()))  # type: ignore[arg-type]
 
 
 def _checked(gl: moderngl.Context) -> moderngl.Context:
@@ -230,7 +231,7 @@ def _load_osmesa() -> Any:
                 failure = str(error)
                 left.append(path)
                 continue
-            if "libOSMesa" in os.path.basename(path):
+            if Path(path).name.startswith("libOSMesa"):
                 return library
         if len(left) == len(waiting):
             break

@@ -154,10 +154,10 @@ def _repeated(values: Any, n: int, what: str) -> list[Any]:
     """One value n times, or n values as they are."""
     if isinstance(values, (Camera, Light)):
         return [values] * n
-    values = list(values)
-    if len(values) != n:
-        raise ValueError(f"Renderer: {len(values)} {what} for {n} poses; give one, or one for each pose")
-    return values
+    out = list(values)
+    if len(out) != n:
+        raise ValueError(f"Renderer: {len(out)} {what} for {n} poses; give one, or one for each pose")
+    return out
 
 
 def _check_poses(poses: list[Pose]) -> None:

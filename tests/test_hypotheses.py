@@ -1,0 +1,113 @@
+"""First poses: the template search on rendered photographs, and MV-Net's frame."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from objects import bracket
+
+from posekit.camera import Camera, mask_box
+from posekit.errors import WeightsError
+from posekit.geometry import Pose, random_rotation, rotation_angle
+from posekit.hypotheses import MVNetSearch, TemplateSearch
+from posekit.nets.heads import Prediction
+from posekit.nets.lite import LiteConfig
+from posekit.nets.pose_delta import delta_between
+from posekit.nets.weights import build
+from posekit.render import Light, Renderer
+from posekit.results import Detection
+from posekit.view import View
+from posekit.zoom import zoom_to_box
+
+CAMERA = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
+
+
+@pytest.fixture(scope="module")
+def renderer() -> Renderer:
+    return Renderer()
+
+
+def seen(renderer: Renderer, truth: Pose) -> tuple[View, Detection]:
+    """A photograph under another light than the templates', and its true mask."""
+    view = renderer.render(bracket(), [truth], CAMERA, light=Light(direction=(0.7, -0.3, -0.5), ambient=0.35))[0]
+    assert view.mask is not None
+    box = mask_box(view.mask)
+    assert box is not None
+    return View(view.image, CAMERA), Detection(box, view.mask, 1.0, "bracket", "mask")
+
+
+def test_the_search_finds_the_pose_among_its_best(renderer: Renderer) -> None:
+    model = bracket()
+    search = TemplateSearch(model, renderer)
+    rng = np.random.default_rng(1)
+    near, depths, sides = [], [], []
+    for _ in range(12):
+        place = np.array([rng.uniform(-0.3, 0.3), rng.uniform(-0.2, 0.2), rng.uniform(0.5, 1.0)])
+        truth = Pose(random_rotation(rng), place) @ model.T_obj_ctr.inverse()
+        view, detection = seen(renderer, truth)
+        found = search.search(view, detection, 5)
+        assert 1 <= len(found) <= 5
+        assert [h.score for h in found] == sorted((h.score for h in found), reverse=True)
+        turn = [np.rad2deg(rotation_angle(h.T_cam_obj.R.T @ truth.R)) for h in found]
+        best = found[int(np.argmin(turn))].T_cam_obj @ model.T_obj_ctr
+        near.append(min(turn))
+        depths.append(abs(best.t[2] / place[2] - 1))
+        sides.append(np.linalg.norm(best.t[:2] - place[:2]))
+    assert np.mean(np.array(near) < 25) >= 0.9
+    assert np.median(depths) < 0.05 and np.median(sides) < 0.01
+
+
+def test_hypotheses_lie_apart_and_an_empty_mask_gives_none(renderer: Renderer) -> None:
+    model = bracket()
+    truth = Pose(np.eye(3), [0.0, 0.0, 0.7]) @ model.T_obj_ctr.inverse()
+    view, detection = seen(renderer, truth)
+    search = TemplateSearch(model, renderer)
+    found = search.search(view, detection, 8)
+    for k, a in enumerate(found):
+        assert all(rotation_angle(a.T_cam_obj.R.T @ b.T_cam_obj.R) > search.options.apart for b in found[:k])
+    empty = dataclasses.replace(detection, mask=np.zeros((480, 640), bool))
+    assert search.search(view, empty, 5) == []
+
+
+def test_mvnet_answers_relative_to_the_frontal_view(renderer: Renderer) -> None:
+    """With an MV-Net that knows the truth the first pose is the truth: its frame is what the docstring says."""
+    model = bracket()
+    truth = Pose(random_rotation(np.random.default_rng(3)), [0.25, -0.15, 0.8]) @ model.T_obj_ctr.inverse()
+    view, detection = seen(renderer, truth)
+    networks = build("lite", LiteConfig(widths=(8, 16, 16), features=16, hidden=16, context=16))
+    search = MVNetSearch(model, networks, renderer)
+    zoom = zoom_to_box(CAMERA, detection.box, networks.size)
+    target = Pose.rotation(zoom.R_view_cam) @ truth @ model.T_obj_ctr
+    delta = delta_between(search.frontal(zoom.camera), target, zoom.camera.fx)
+    assert abs(delta.v[2]) < 0.7, "the box gives the depth to within a factor of two"
+
+    class Knowing(torch.nn.Module):
+        def forward(self, observed: torch.Tensor, views: torch.Tensor) -> Prediction:
+            assert observed.shape == (1, 4, 120, 160) and views.shape == (1, 6, 4, 120, 160)
+            quat = torch.from_numpy(Pose.rotation(delta.R).quat_wxyz)[None]
+            return Prediction(quat, torch.from_numpy(delta.v)[None])
+
+    search.mvnet = Knowing()  # type: ignore[assignment]
+    found = search.search(view, detection, 5)
+    assert len(found) == 1
+    np.testing.assert_allclose(found[0].T_cam_obj.matrix, truth.matrix, atol=1e-6)
+
+
+def test_mvnet_views_are_the_six_faces(renderer: Renderer) -> None:
+    networks = build("lite", LiteConfig(widths=(8, 16, 16), features=16, hidden=16, context=16))
+    search = MVNetSearch(bracket(), networks, renderer)
+    looking = np.stack([R[2] for R in search.rotations])  # the optical axis in the object's frame
+    np.testing.assert_allclose(looking @ looking.T, np.round(looking @ looking.T), atol=1e-12)
+    assert len({tuple(np.round(d).astype(int)) for d in looking}) == 6
+    assert search.views.shape == (6, 4, 120, 160) and (search.views[:, 3].sum((1, 2)) > 100).all()
+    found = search.search(*seen(renderer, Pose(np.eye(3), [0.0, 0.0, 0.7])), 5)
+    assert len(found) <= 1, "an untrained network still answers in the right form"
+
+
+def test_mvnet_without_weights_is_refused(renderer: Renderer) -> None:
+    networks = dataclasses.replace(build("lite"), mvnet=None)
+    with pytest.raises(WeightsError, match="--init templates"):
+        MVNetSearch(bracket(), networks, renderer)
