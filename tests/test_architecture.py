@@ -15,8 +15,8 @@ SOURCE = Path(__file__).resolve().parent.parent / "src" / "posekit"
 # Rooms that are planned stand here too; a room that is built must stand here.
 LAYERS = {
     0: {"geometry", "camera", "files"},
-    1: {"view", "object_model", "results", "load"},
-    2: {"zoom", "metrics", "pnp", "render", "nets", "detect", "draw"},
+    1: {"view", "object_model", "results"},
+    2: {"load", "zoom", "metrics", "pnp", "render", "nets", "detect", "draw"},
     3: {"data", "refine", "hypotheses", "figures"},
     4: {"estimate"},
     5: {"track", "evaluate", "train"},

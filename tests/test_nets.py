@@ -14,8 +14,8 @@ from posekit.errors import WeightsError
 from posekit.nets.flownet import LAYERS, FlowNetEncoder
 from posekit.nets.heads import PoseHeads, Prediction, compress_angle, expand_angle
 from posekit.nets.inputs import images_to_tensor, to_input
-from posekit.nets.lite import Correlation, LiteConfig, LiteMVNet, LiteSVNet
-from posekit.nets.losses import Target, dense_loss, mvnet_loss, svnet_loss
+from posekit.nets.lite import Correlation, LiteConfig, LiteMVNet, LiteSVNet, likeness_of
+from posekit.nets.losses import Target, dense_loss, matching_loss, mvnet_loss, svnet_loss
 from posekit.nets.paper import Branch, PaperMVNet, PaperSVNet
 from posekit.nets.weights import PaperConfig, build, find_weights, load_networks, save_networks
 
@@ -89,11 +89,13 @@ def test_a_foreign_checkpoint_is_refused() -> None:
 
 def test_lite_answers_on_its_anchors() -> None:
     net = LiteSVNet(SMALL).eval()
-    prediction, flows, angle = net.predict(pictures(3, SMALL.size), pictures(3, SMALL.size, 1))
+    output = net.predict(pictures(3, SMALL.size), pictures(3, SMALL.size, 1))
+    prediction = output.prediction
     assert prediction.flow is not None and prediction.flow.shape == (3, 2, 12, 16)
     assert prediction.log_scale is not None and prediction.log_scale.shape == (3, 12, 16)
     assert prediction.visibility is not None and prediction.visibility.shape == (3, 12, 16)
-    assert [f.shape for f in flows] == [(3, 2, 6, 8)] * SMALL.updates and angle.shape == (3,)
+    assert [f.shape for f in output.flows] == [(3, 2, 6, 8)] * SMALL.updates
+    assert output.compressed_angle.shape == (3,) and output.likeness.shape == (3, 48, 48)
 
 
 def test_the_lite_preset_is_small_and_answers_in_one_batch_as_alone() -> None:
@@ -129,7 +131,9 @@ def test_correlation_finds_a_shifted_picture() -> None:
     rendered = torch.randn(1, 32, 12, 16, generator=generator)
     observed = torch.roll(rendered, shifts=(1, 2), dims=(2, 3))  # down 1, right 2
     ys, xs = torch.meshgrid(torch.arange(12.0), torch.arange(16.0), indexing="ij")
-    found = Correlation(rendered, observed, levels=1, radius=3).lookup(torch.stack([xs, ys])[None])
+    found = Correlation(likeness_of(rendered, observed), (12, 16), levels=1, radius=3).lookup(
+        torch.stack([xs, ys])[None]
+    )
     best = found[0, :, 4:8, 4:10].argmax(0)  # away from the sides; window rows are y, columns x
     assert torch.all(best // 7 - 3 == 1) and torch.all(best % 7 - 3 == 2)
 
@@ -141,7 +145,8 @@ def test_correlation_levels_look_at_the_same_place() -> None:
     observed[0, 0, 2:4, 4:6] = 1  # centre (4.5, 2.5): the centre of a cell of level 1
     centre = torch.zeros(1, 2, 8, 8)
     centre[:, 0], centre[:, 1] = 4.5, 2.5
-    found = Correlation(rendered, observed, levels=2, radius=1).lookup(centre)[0, :, 4, 4].view(2, 3, 3)
+    likeness = torch.einsum("bcn,bcm->bnm", rendered.flatten(2), observed.flatten(2))
+    found = Correlation(likeness, (8, 8), levels=2, radius=1).lookup(centre)[0, :, 4, 4].view(2, 3, 3)
     torch.testing.assert_close(found[0, 1, 1], torch.tensor(1.0))
     torch.testing.assert_close(found[1], torch.tensor([[0.0, 0, 0], [0, 1, 0], [0, 0, 0]]))
 
@@ -193,12 +198,23 @@ def random_target(count: int, config: LiteConfig) -> Target:
                   torch.randn(count, 3, generator=generator), torch.rand(count, generator=generator), lost)  # fmt: skip
 
 
+def test_the_matching_loss_is_least_where_the_truth_is() -> None:
+    flow = torch.full((1, 2, 6, 8), 8.0)  # one cell right, one down
+    shown = torch.ones(1, 6, 8, dtype=torch.bool)
+    right = torch.zeros(1, 48, 48)
+    for y in range(5):
+        for x in range(7):
+            right[0, y * 8 + x, (y + 1) * 8 + x + 1] = 50.0
+    assert float(matching_loss(right, flow, shown)) < 0.1
+    assert float(matching_loss(right, torch.zeros_like(flow), shown)) > 10
+    assert float(matching_loss(torch.zeros(1, 48, 48), flow, shown)) == pytest.approx(np.log(48), rel=1e-4)
+
+
 def test_lost_pairs_teach_the_angle_alone() -> None:
     net = LiteSVNet(SMALL)
     target = random_target(2, SMALL)
     target.lost[:] = True
-    prediction, flows, angle = net.predict(pictures(2, SMALL.size), pictures(2, SMALL.size, 1))
-    loss, parts = dense_loss(prediction, flows, angle, net.heads, target)
+    loss, parts = dense_loss(net.predict(pictures(2, SMALL.size), pictures(2, SMALL.size, 1)), net.heads, target)
     assert parts["rotation"] == parts["translation"] == parts["likelihood"] == 0
     loss.backward()
     assert net.heads.rotation.weight.grad is None or not net.heads.rotation.weight.grad.any()
@@ -215,8 +231,7 @@ def test_one_batch_is_over_fitted() -> None:
     optimiser = torch.optim.AdamW(net.parameters(), lr=3e-3)
     found: list[dict[str, float]] = []
     for _ in range(150):
-        prediction, flows, angle = net.predict(observed, rendered)
-        loss, parts = dense_loss(prediction, flows, angle, net.heads, target)
+        loss, parts = dense_loss(net.predict(observed, rendered), net.heads, target)
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from raycaster import cast
 
 import posekit
 from posekit.camera import Camera, mask_box
@@ -20,6 +19,7 @@ from posekit.errors import RenderError
 from posekit.geometry import Pose, random_rotation, so3_exp
 from posekit.object_model import ObjectModel
 from posekit.render import Light, Renderer, context, info, render_views, view_rotations
+from raycaster import cast
 
 CAMERA = Camera(fx=210.0, fy=190.0, cx=70.25, cy=66.5, width=160, height=120)  # off its axis, fx != fy
 UNIT_SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=np.float64)

@@ -5,7 +5,10 @@ Commands import what they need when they run, so that ``posekit --help`` loads n
 
 from __future__ import annotations
 
+import logging
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Annotated, Any
 
 import typer
@@ -23,8 +26,7 @@ class Commands(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         try:
-            with warnings.catch_warnings():
-                warnings.showwarning = _show_warning
+            with _messages():
                 return super().invoke(ctx)
         except PosekitError as error:
             if ctx.params.get("debug"):
@@ -34,6 +36,28 @@ class Commands(TyperGroup):
         except KeyboardInterrupt as error:
             _tell("interrupted", "nothing more is written", typer.colors.RED)
             raise typer.Exit(INTERRUPTED) from error
+
+
+@contextmanager
+def _messages() -> Iterator[None]:
+    """The library's log and Python's warnings as lines on standard error."""
+    log, handler = logging.getLogger("posekit"), _LogLines()
+    level = log.level
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            yield
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(level)
+
+
+class _LogLines(logging.Handler):
+    def emit(self, record: logging.LogRecord) -> None:
+        loud = record.levelno >= logging.WARNING
+        _tell("warning" if loud else "note", record.getMessage(), typer.colors.YELLOW if loud else typer.colors.BLUE)
 
 
 def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -15,7 +15,6 @@ from posekit.cli.options import (
     ImageArgument,
     IterationsOption,
     JsonOption,
-    MaskFrom,
     MaskFromOption,
     MaskOption,
     ModelOption,
@@ -30,10 +29,6 @@ from posekit.cli.options import (
     UpdateOption,
     WeightsOption,
 )
-from posekit.errors import PromptError
-
-if TYPE_CHECKING:
-    from posekit.detect import Detector
 
 InitOption = Annotated[
     Literal["templates", "mvnet"], typer.Option(help="Where first poses come from.", rich_help_panel=LOOP)
@@ -66,25 +61,20 @@ def estimate(
 ) -> None:
     """Estimate an object's pose in a photograph, from its mesh and a box or a mask."""
     from posekit.cli.output import Destination
+
+    destination = Destination.chosen(out, Path("posekit-out") / image.stem, force, json)
+
+    from posekit.cli.prompts import detector_for
+    from posekit.estimate import EstimateOptions, PoseEstimator
     from posekit.object_model import ObjectModel
     from posekit.view import load_view
 
-    destination = Destination.chosen(out, Path("posekit-out") / image.stem, force, json)
-    detector = prompt(box, mask, mask_from)
+    options = EstimateOptions(init, hypotheses, update, stop, iterations, stop_angle, seed)
     view = load_view(image, camera)
-    detections = detector.detect(view, [])
     mesh = ObjectModel.load(model, units=units, symmetry=symmetry)
-
-
-def prompt(box: str | None, mask: Path | None, mask_from: MaskFrom) -> Detector:
-    """The detector that ``--box`` or ``--mask`` stand for. Raises PromptError unless exactly one is given."""
-    from posekit.detect import BoxPrompt, MaskPrompt
-    from posekit.results import load_mask, parse_box
-
-    if box is not None and mask is not None:
-        raise PromptError("--box and --mask were both given: a mask needs no box; pass one of them.")
-    if mask is not None:
-        return MaskPrompt(load_mask(mask))
-    if box is None:
-        raise PromptError("where is the object? Pass --box x0,y0,x1,y1 (pixels) or --mask PNG.")
-    return BoxPrompt(parse_box(box), mask_from)
+    detections = detector_for(box, mask, mask_from).detect(view, [mesh])
+    with destination.working("loading the networks"):
+        estimator = PoseEstimator(mesh, preset=preset, weights=weights, options=options, threads=threads)
+    with destination.working("estimating"):
+        estimates = estimator.estimate(view, detections)
+    destination.deliver(estimator, view, estimates)

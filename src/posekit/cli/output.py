@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import typer
 
 from posekit.errors import OutputError
 from posekit.files import write_bytes_atomic, write_text_atomic
-from posekit.results import Estimate
+from posekit.results import Estimate, estimates_to_json
+
+if TYPE_CHECKING:
+    from posekit.estimate import PoseEstimator
+    from posekit.view import View
 
 
 @dataclass(frozen=True)
@@ -71,32 +77,52 @@ class Destination:
         """Tell the person something; on standard error where standard output is for JSON."""
         typer.echo(text, err=self.json == "-")
 
-    def write(self, result: str, overlay: bytes | None) -> None:
-        """Write the result (JSON text) and the overlay (PNG) to wherever they were asked for."""
+    @contextmanager
+    def working(self, what: str) -> Iterator[None]:
+        """Show what is being done, on a terminal only."""
+        from rich.console import Console
+
+        with Console(stderr=True).status(f"{what} ..."):
+            yield
+
+    def deliver(self, estimator: PoseEstimator, view: View, estimates: Sequence[Estimate]) -> None:
+        """Print the estimates and write them: the result as JSON, and the overlay."""
+        from posekit import draw
+        from posekit.figures import overlay
+
+        result = _result(estimator, view, estimates)
+        for estimate in estimates:
+            self.say(describe(estimate))
+        if not estimates:
+            self.say(f"no pose: nothing in the picture could be taken for {estimator.model.name}.")
         if self.folder is not None:
-            if overlay is not None:
-                self.say(f"overlay: {self.folder.write('overlay.png', overlay)}")
-            self.say(f"result:  {self.folder.write('result.json', result)}")
+            picture = draw.png(overlay(estimator.renderer, estimator.model, view, estimates))
+            self.say(f"overlay: {self.folder.write('overlay.png', picture)}")
+            self.say(f"result: {self.folder.write('result.json', result)}")
         if self.json == "-":
-            sys.stdout.write(result)
+            typer.echo(result, nl=False)
         elif self.json is not None:
             write_text_atomic(Path(self.json), result)
-            self.say(f"result:  {self.json}")
+            self.say(f"result: {self.json}")
 
 
-def describe(estimates: Sequence[Estimate]) -> str:
-    """The estimates for a person, some lines each."""
-    return "\n".join(_describe(estimate) for estimate in estimates)
-
-
-def _describe(estimate: Estimate) -> str:
-    pose = estimate.T_cam_obj
-    rows = "\n".join("    " + " ".join(f"{value:9.5f}" for value in row) for row in pose.matrix)
+def describe(estimate: Estimate) -> str:
+    """An estimate for a person, some lines."""
+    rows = "\n".join("    " + " ".join(f"{value:9.5f}" for value in row) for row in estimate.T_cam_obj.matrix)
     state = "converged" if estimate.converged else "not converged"
     steps = f"{estimate.iterations} iteration{'' if estimate.iterations == 1 else 's'}"
-    seconds = estimate.timings.get("total", 0.0)
     return (
         f"{estimate.model}: T_cam_obj (metres)\n{rows}\n"
         f"    predicted error {np.rad2deg(estimate.angle):.1f} degrees, {state} after {steps}, "
-        f"score {estimate.score:.2f}, {seconds:.1f} s"
+        f"score {estimate.score:.2f}, {estimate.timings['total']:.1f} s"
+    )
+
+
+def _result(estimator: PoseEstimator, view: View, estimates: Sequence[Estimate]) -> str:
+    camera = view.camera
+    return estimates_to_json(
+        estimates,
+        weights_hash=estimator.weights_hash,
+        versions={name: version(name) for name in ("torch", "numpy", "opencv-python-headless", "moderngl")},
+        about={"camera": {"K": camera.K, "width": camera.width, "height": camera.height}},
     )

@@ -105,17 +105,11 @@ def random_light(rng: np.random.Generator) -> Light:
     )
 
 
-def outline_points(model: ObjectModel, limit: int = 300) -> NDArray[np.float64]:
-    """(N, 3) in ``ctr``: enough of the mesh's vertices to bound it in a picture."""
-    step = max(1, len(model.vertices) // limit)
-    return model.vertices[::step].astype(np.float64) - model.center
-
-
 def render_pairs(
     renderer: Renderer, model: ObjectModel, count: int, config: PairConfig, rng: np.random.Generator
 ) -> list[Pair]:
     """``count`` pairs of one object, drawn in two batches."""
-    outline = outline_points(model)
+    outline = model.outline - model.center
     T_ctr_obj = model.T_obj_ctr.inverse()
     sources, targets, cameras, lost = [], [], [], []
     whole = Camera.from_fov(1.0, *config.size)

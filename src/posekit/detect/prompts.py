@@ -58,7 +58,7 @@ class BoxPrompt:
         mask = grabcut_mask(view.image, box) if self.mask_from == "grabcut" else None
         source = "box+filled" if mask is None else "box+grabcut"
         mask = filled_mask(box, view.camera) if mask is None else mask
-        return [Detection(box=box, mask=mask, model=model.name, source=source) for model in models]
+        return [Detection(box=box, mask=mask, label=model.name, source=source) for model in models]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ class MaskPrompt:
         box = mask_box(self.mask)
         if box is None:
             raise PromptError("the mask is empty: its pixels must be brighter than 0 where the object is.")
-        return [Detection(box=box, mask=self.mask, model=model.name, source="mask") for model in models]
+        return [Detection(box=box, mask=self.mask, label=model.name, source="mask") for model in models]
 
 
 def clip_box(box: Box, camera: Camera) -> Box:

@@ -64,18 +64,20 @@ class Tower(nn.Module):
 
 
 class Correlation:
-    """All-pairs correlation of two feature maps (B, C, h, w), pooled ``levels`` times, looked up around a flow."""
+    """The likeness of every rendered with every observed cell, pooled ``levels`` times, looked up around a flow.
 
-    def __init__(self, rendered: Tensor, observed: Tensor, levels: int, radius: int) -> None:
-        B, C, h, w = rendered.shape
-        volume = torch.einsum("bcn,bcm->bnm", rendered.flatten(2), observed.flatten(2)).float() * C**-0.5
-        pooled = volume.reshape(B * h * w, 1, h, w)
+    likeness: (B, h * w, h' * w'), rendered first. shape: (h, w), the same for both.
+    """
+
+    def __init__(self, likeness: Tensor, shape: tuple[int, int], levels: int, radius: int) -> None:
+        (B, n, _), (h, w) = likeness.shape, shape
+        pooled = likeness.reshape(B * n, 1, h, w)
         self.pyramid = [pooled]
         for _ in range(levels - 1):
             pooled = F.avg_pool2d(pooled, 2, ceil_mode=True, count_include_pad=False)
             self.pyramid.append(pooled)
         self.shape = (B, h, w)
-        steps = torch.arange(-radius, radius + 1, device=rendered.device, dtype=torch.float32)
+        steps = torch.arange(-radius, radius + 1, device=likeness.device, dtype=torch.float32)
         self.window = torch.stack(torch.meshgrid(steps, steps, indexing="xy"), dim=-1)  # (d, d, 2), x first
 
     def lookup(self, centre: Tensor) -> Tensor:
@@ -132,6 +134,23 @@ class Summary(nn.Module):
         return self.fc(self.convs(x).flatten(1))
 
 
+def likeness_of(rendered: Tensor, observed: Tensor) -> Tensor:
+    """Cosines of all pairs of cells: two (B, C, h, w) -> (B, h * w, h * w), rendered first."""
+    a, b = F.normalize(rendered.flatten(2), dim=1), F.normalize(observed.flatten(2), dim=1)
+    return torch.einsum("bcn,bcm->bnm", a, b).float()
+
+
+@dataclass(frozen=True, eq=False)
+class LiteOutput:
+    """All that the lite losses look at. flows: (B, 2, h, w) in pixels after each update, on cells.
+    compressed_angle: (B,). likeness: (B, h * w, h * w), logits of which observed cell each rendered one is."""
+
+    prediction: Prediction
+    flows: list[Tensor]
+    compressed_angle: Tensor
+    likeness: Tensor
+
+
 class LiteSVNet(nn.Module):
     """SV-Net of the lite preset."""
 
@@ -141,6 +160,7 @@ class LiteSVNet(nn.Module):
         a, b, c = config.widths
         self.tower = Tower(4, config.widths, config.features)
         self.context = Tower(8, (a, b, config.context), 4 * config.hidden)
+        self.sharpness = nn.Parameter(torch.tensor(10.0))
         self.update = Update(config)
         self.dense = nn.Sequential(
             nn.Conv2d(config.hidden + config.context, 128, 3, 1, 1), nn.ReLU(), nn.Conv2d(128, 4 * 4, 1)
@@ -151,10 +171,10 @@ class LiteSVNet(nn.Module):
 
     def forward(self, observed: Tensor, rendered: Tensor) -> Prediction:
         """observed, rendered: (B, 4, H, W)."""
-        return self.predict(observed, rendered)[0]
+        return self.predict(observed, rendered).prediction
 
-    def predict(self, observed: Tensor, rendered: Tensor) -> tuple[Prediction, list[Tensor], Tensor]:
-        """The prediction, the flow (B, 2, h, w) in pixels after each update, and the compressed angle (B,)."""
+    def predict(self, observed: Tensor, rendered: Tensor) -> LiteOutput:
+        """As ``forward``, with what the losses need."""
         B = observed.shape[0]
         features = self.tower(torch.cat([observed, rendered]))
         observed_features, rendered_features = features.float().chunk(2)
@@ -162,8 +182,9 @@ class LiteSVNet(nn.Module):
         context = self.context(pair)
         state = torch.tanh(context[:, : self.config.hidden])
         gates = context[:, self.config.hidden :]
-        correlation = Correlation(rendered_features, observed_features, self.config.levels, self.config.radius)
         h, w = state.shape[-2:]
+        likeness = self.sharpness * likeness_of(rendered_features, observed_features)
+        correlation = Correlation(likeness, (h, w), self.config.levels, self.config.radius)
         home = _grid(h, w, observed)
         flow = home.new_zeros(B, 2, h, w)
         flows = []
@@ -180,7 +201,8 @@ class LiteSVNet(nn.Module):
         summary = self.summary(torch.cat([state, flow.detach().to(state.dtype), masks.to(state.dtype)], dim=1))
         quat, v, angle = self.heads(summary)
         assert angle is not None
-        return Prediction(quat, v, expand_angle(angle), fine, log_scale, dense[:, 3]), flows, angle
+        prediction = Prediction(quat, v, expand_angle(angle), fine, log_scale, dense[:, 3])
+        return LiteOutput(prediction, flows, angle, likeness)
 
 
 class LiteMVNet(nn.Module):
@@ -214,8 +236,7 @@ class LiteMVNet(nn.Module):
     def _branch(self, observed: Tensor, view: Tensor) -> Tensor:
         """Two (N, C + 1, h, w) -> (N, 256)."""
         h, w = view.shape[-2:]
-        a, b = F.normalize(view[:, :-1], dim=1).flatten(2), F.normalize(observed[:, :-1], dim=1).flatten(2)
-        likeness = torch.einsum("ncp,ncq->npq", a, b)
+        likeness = likeness_of(view[:, :-1], observed[:, :-1])
         share = torch.softmax(self.sharpness * likeness, dim=2)
         home = _grid(h, w, view).flatten(2)  # (1, 2, h * w)
         place = torch.einsum("npq,xcq->ncp", share, home)

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from posekit.nets.heads import PoseHeads, Prediction, compress_angle
+from posekit.nets.lite import CELL, LiteOutput
 
 
 def paper_pose_loss(prediction: Prediction, heads: PoseHeads, quat_wxyz: Tensor, v: Tensor) -> Tensor:
@@ -42,6 +43,7 @@ class DenseLossConfig:
     gamma: float = 0.8
     hidden: float = 0.3
     flow: float = 0.25
+    match: float = 1.0
     likelihood: float = 0.5
     visibility: float = 1.0
     rotation: float = 1.0
@@ -64,17 +66,10 @@ class Target:
 
 
 def dense_loss(
-    prediction: Prediction,
-    flows: list[Tensor],
-    compressed_angle: Tensor,
-    heads: PoseHeads,
-    target: Target,
-    config: DenseLossConfig = DenseLossConfig(),
+    output: LiteOutput, heads: PoseHeads, target: Target, config: DenseLossConfig = DenseLossConfig()
 ) -> tuple[Tensor, dict[str, float]]:
-    """The lite preset's loss and its parts.
-
-    flows: (B, 2, h/2, w/2) in pixels after each update. Lost pairs teach the angle only.
-    """
+    """The lite preset's loss and its parts. Lost pairs teach the angle only."""
+    prediction, flows = output.prediction, output.flows
     assert prediction.flow is not None and prediction.log_scale is not None and prediction.visibility is not None
     near = (target.flow.abs().amax(1) < config.max_flow_px) & target.valid & ~target.lost[:, None, None]
     weight = near * (config.hidden + (1 - config.hidden) * target.visible)
@@ -85,6 +80,9 @@ def dense_loss(
     for k, flow in enumerate(flows):
         error = (flow - flow_cells).abs().sum(1, keepdim=True)
         sequence = sequence + config.gamma ** (len(flows) - 1 - k) * (error * cells).sum() / total_cells
+
+    shown = F.avg_pool2d((near & target.visible)[:, None].float(), 2)[:, 0] > 0.5
+    match = matching_loss(output.likeness, flow_cells, shown)
 
     total = weight.sum().clamp_min(1.0)
     error = (prediction.flow - target.flow).abs().sum(1)
@@ -98,9 +96,10 @@ def dense_loss(
     quat = prediction.quat_wxyz
     rotation = (((quat - target.quat_wxyz) / heads.quat_std).abs().mean(1) * kept).sum() / count
     translation = (((prediction.v - target.v) / heads.v_std).abs().mean(1) * kept).sum() / count
-    angle = (compressed_angle - compress_angle(target.angle)).abs().mean()
+    angle = (output.compressed_angle - compress_angle(target.angle)).abs().mean()
     loss = (
         config.flow * sequence
+        + config.match * match
         + config.likelihood * likelihood
         + config.visibility * visibility
         + config.rotation * rotation
@@ -109,6 +108,29 @@ def dense_loss(
     )
     seen = (near & target.visible).float()
     epe = ((prediction.flow - target.flow).detach().norm(dim=1) * seen).sum() / seen.sum().clamp_min(1.0)
-    parts = {"epe_px": epe, "likelihood": likelihood, "visibility": visibility, "rotation": rotation,
+    parts = {"epe_px": epe, "match": match, "likelihood": likelihood, "visibility": visibility, "rotation": rotation,
              "translation": translation, "angle": angle}  # fmt: skip
     return loss, {name: float(value.detach()) for name, value in parts.items()}
+
+
+def matching_loss(likeness: Tensor, flow: Tensor, shown: Tensor) -> Tensor:
+    """Cross-entropy of the cell that each shown rendered cell lies on in the observed crop.
+
+    likeness: (B, h * w, h * w), logits. flow: (B, 2, h, w), the truth in pixels. shown: (B, h, w) bool. A place
+    between cells counts for its four neighbours, bilinearly; without it the features learn to match only
+    through the recurrent updates, several times more slowly (docs/log.md).
+    """
+    B, _, h, w = flow.shape
+    ys, xs = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
+    x, y = xs + flow[:, 0] / CELL, ys + flow[:, 1] / CELL
+    inside = shown & (x >= 0) & (x <= w - 1) & (y >= 0) & (y <= h - 1)
+    x, y = x.clamp(0, w - 1.001), y.clamp(0, h - 1.001)
+    x0, y0 = x.floor(), y.floor()
+    fx, fy = x - x0, y - y0
+    first = (y0 * w + x0).long()
+    logits = torch.log_softmax(likeness, dim=2).view(B, h, w, h * w)
+    total = torch.zeros(())
+    for dy, dx, share in ((0, 0, (1 - fx) * (1 - fy)), (0, 1, fx * (1 - fy)), (1, 0, (1 - fx) * fy), (1, 1, fx * fy)):
+        found = logits.gather(3, (first + dy * w + dx).unsqueeze(3)).squeeze(3)
+        total = total - (found * share * inside).sum()
+    return total / inside.sum().clamp_min(1)

@@ -34,8 +34,8 @@ def view_rotations(n: int) -> list[NDArray[np.float64]]:
 def fit_distance(model: ObjectModel, camera: Camera) -> float:
     """How far (metres) the model's centre must be on the optical axis for its bounding sphere to fit the picture."""
     radius = float(np.linalg.norm(model.vertices.astype(np.float64) - model.center, axis=1).max())
-    edges = camera.backproject([[-0.5, -0.5], [camera.width - 0.5, camera.height - 0.5]])[:, :2]
-    narrowest = float(np.abs(edges).min())
+    corners = camera.box_corner_rays((0, 0, *camera.size))
+    narrowest = float(np.abs(corners[:, :2]).min())  # tangent of the angle to the nearest side
     return _MARGIN * radius / float(np.sin(np.arctan(narrowest)))
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch.optim.swa_utils import AveragedModel
 from torch.utils.data import DataLoader
 
 from posekit.data.stream import PairStream, StreamConfig, load_photos
@@ -84,8 +84,8 @@ def validate(net: LiteSVNet, held_back: list[dict[str, Tensor]], config: DenseLo
     sums: dict[str, float] = {}
     for batch in held_back:
         with torch.autocast("cpu", dtype=torch.bfloat16):
-            prediction, flows, angle = net.predict(images_to_tensor(batch["observed"]), images_to_tensor(batch["rendered"]))
-        loss, parts = dense_loss(prediction, flows, angle, net.heads, to_target(batch), config)
+            output = net.predict(images_to_tensor(batch["observed"]), images_to_tensor(batch["rendered"]))
+        loss, parts = dense_loss(output, net.heads, to_target(batch), config)
         for name, value in {"loss": float(loss), **parts}.items():
             sums[name] = sums.get(name, 0.0) + value / len(held_back)
     return sums
@@ -99,13 +99,23 @@ class Trainer:
         self.networks = build("lite")
         assert isinstance(self.networks.svnet, LiteSVNet)
         self.net = self.networks.svnet.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.average = AveragedModel(self.net, multi_avg_fn=get_ema_multi_avg_fn(config.ema), use_buffers=True)
+        self.average = AveragedModel(self.net, multi_avg_fn=self._average, use_buffers=True)
         weights = [p for p in self.net.parameters() if p.ndim > 1]
         others = [p for p in self.net.parameters() if p.ndim <= 1]
         groups = [{"params": weights, "weight_decay": config.decay}, {"params": others, "weight_decay": 0.0}]
         self.optimiser = torch.optim.AdamW(groups, lr=config.rate, fused=True)
         self.step = 0
         self.seconds = 0.0
+
+    @torch.no_grad()
+    def _average(self, averages: list[Tensor], currents: list[Tensor], count: Tensor) -> None:
+        """An exponential moving average that forgets its first values faster: the decay grows to ``ema``."""
+        decay = min(self.config.ema, (1.0 + float(count)) / (10.0 + float(count)))
+        for average, current in zip(averages, currents, strict=True):
+            if average.is_floating_point():
+                average.lerp_(current.to(average.dtype), 1.0 - decay)
+            else:
+                average.copy_(current)
 
     @property
     def checkpoint(self) -> Path:
@@ -140,10 +150,8 @@ class Trainer:
             group["lr"] = rate_at(self.step, self.config)
         self.net.train()
         with torch.autocast("cpu", dtype=torch.bfloat16):
-            prediction, flows, angle = self.net.predict(
-                images_to_tensor(batch["observed"]), images_to_tensor(batch["rendered"])
-            )
-        loss, parts = dense_loss(prediction, flows, angle, self.net.heads, to_target(batch), self.config.loss)
+            output = self.net.predict(images_to_tensor(batch["observed"]), images_to_tensor(batch["rendered"]))
+        loss, parts = dense_loss(output, self.net.heads, to_target(batch), self.config.loss)
         if not torch.isfinite(loss):
             raise FloatingPointError(f"the loss became {float(loss)} at step {self.step}; {self.checkpoint} is intact")
         self.optimiser.zero_grad(set_to_none=True)
@@ -212,9 +220,13 @@ def main() -> None:
     parser.add_argument("--run", type=Path, required=True, help="folder of checkpoints and logs; resumed where it exists")
     parser.add_argument("--backgrounds", type=Path, help="folder of photographs for backgrounds and textures")
     parser.add_argument("--steps", type=int, default=PoseTrainConfig.steps)
+    parser.add_argument("--batch", type=int, default=StreamConfig.batch)
+    parser.add_argument("--rate", type=float, default=PoseTrainConfig.rate)
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     args = parser.parse_args()
-    train(PoseTrainConfig(steps=args.steps, threads=args.threads), args.run, args.backgrounds)
+    stream = StreamConfig(batch=args.batch)
+    config = PoseTrainConfig(steps=args.steps, rate=args.rate, threads=args.threads, stream=stream)
+    train(config, args.run, args.backgrounds)
 
 
 if __name__ == "__main__":

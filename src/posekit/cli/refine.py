@@ -1,0 +1,82 @@
+"""``posekit refine``: a known pose made better."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from posekit.cli.options import (
+    INPUT,
+    BoxOption,
+    CameraOption,
+    ForceOption,
+    ImageArgument,
+    IterationsOption,
+    JsonOption,
+    MaskFromOption,
+    MaskOption,
+    ModelOption,
+    OutOption,
+    PresetOption,
+    SeedOption,
+    StopAngleOption,
+    StopOption,
+    SymmetryOption,
+    ThreadsOption,
+    UnitsOption,
+    UpdateOption,
+    WeightsOption,
+)
+
+PoseOption = Annotated[
+    Path,
+    typer.Option(metavar="FILE", help="JSON: a result of estimate, or T_cam_obj (4x4, metres).", rich_help_panel=INPUT),
+]
+
+
+def refine(
+    image: ImageArgument,
+    model: ModelOption,
+    pose: PoseOption,
+    camera: CameraOption = None,
+    box: BoxOption = None,
+    mask: MaskOption = None,
+    mask_from: MaskFromOption = "grabcut",
+    units: UnitsOption = "auto",
+    symmetry: SymmetryOption = None,
+    preset: PresetOption = "lite",
+    weights: WeightsOption = None,
+    update: UpdateOption = "correspondence",
+    stop: StopOption = "angle",
+    iterations: IterationsOption = 50,
+    stop_angle: StopAngleOption = 2.0,
+    seed: SeedOption = 0,
+    threads: ThreadsOption = None,
+    out: OutOption = None,
+    force: ForceOption = False,
+    json: JsonOption = None,
+) -> None:
+    """Refine a pose that is roughly known; a mask or a box helps, but neither is needed."""
+    from posekit.cli.output import Destination
+
+    destination = Destination.chosen(out, Path("posekit-out") / f"{image.stem}-refined", force, json)
+
+    from posekit.cli.prompts import detector_for
+    from posekit.estimate import EstimateOptions, PoseEstimator
+    from posekit.load import load_pose, load_view
+    from posekit.object_model import ObjectModel
+
+    options = EstimateOptions(update=update, stop=stop, iterations=iterations, stop_angle_deg=stop_angle, seed=seed)
+    start = load_pose(pose)
+    view = load_view(image, camera)
+    mesh = ObjectModel.load(model, units=units, symmetry=symmetry)
+    if box is not None or mask is not None:
+        [detection] = detector_for(box, mask, mask_from).detect(view, [mesh])
+        view = view.with_mask(detection.mask)
+    with destination.working("loading the networks"):
+        estimator = PoseEstimator(mesh, preset=preset, weights=weights, options=options, threads=threads)
+    with destination.working("refining"):
+        refined = estimator.refine(view, start)
+    destination.deliver(estimator, view, [refined])

@@ -1,0 +1,177 @@
+"""Detection and Estimate, and their JSON. Layer 1."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from posekit._version import __version__
+from posekit.camera import Box
+from posekit.errors import PromptError
+from posekit.geometry import Pose
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """Where an object is in a picture.
+
+    box: edges, pixels. mask: bool (H, W), of the picture's size, or None. score: in [0, 1]. label: the object's
+    name, where it is known. source: what found it, such as "box+grabcut" or "mask".
+    """
+
+    box: Box
+    mask: NDArray[np.bool_] | None = None
+    score: float = 1.0
+    label: str | None = None
+    source: str = "box"
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A pose on the refinement's way, and the rotation error (radians) that was predicted for it."""
+
+    T_cam_obj: Pose
+    angle: float
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """An object's pose in a photograph.
+
+    angle: predicted rotation error, radians. iterations: used for this result. converged: whether the angle fell
+    below the threshold. score: in [0, 1], higher is better. box: of the object at this pose, edges, pixels.
+    model: the mesh's name. detection: what it started from. trace: the poses on the way, first to last.
+    timings: seconds by stage.
+    """
+
+    T_cam_obj: Pose
+    angle: float
+    iterations: int
+    converged: bool
+    score: float
+    box: Box
+    model: str
+    detection: Detection | None = None
+    trace: tuple[Step, ...] = ()
+    timings: Mapping[str, float] = field(default_factory=dict)
+
+
+def estimates_to_json(
+    estimates: Sequence[Estimate],
+    *,
+    weights_hash: str | None = None,
+    versions: Mapping[str, str] | None = None,
+    about: Mapping[str, Any] | None = None,
+) -> str:
+    """The result file's text: strict JSON, numbers that are not finite are null.
+
+    versions: of other software, besides posekit's own. about: further entries of the file (image, camera, ...).
+    """
+    document = {
+        **(about or {}),
+        "estimates": [_estimate_to_dict(estimate) for estimate in estimates],
+        "weights_hash": weights_hash,
+        "versions": {"posekit": __version__, **(versions or {})},
+    }
+    return json.dumps(_strict(document), indent=1, allow_nan=False) + "\n"
+
+
+def estimate_to_json(
+    estimate: Estimate,
+    *,
+    weights_hash: str | None = None,
+    versions: Mapping[str, str] | None = None,
+    about: Mapping[str, Any] | None = None,
+) -> str:
+    """`estimates_to_json` of one."""
+    return estimates_to_json([estimate], weights_hash=weights_hash, versions=versions, about=about)
+
+
+def estimates_from_json(text: str) -> list[Estimate]:
+    """What `estimates_to_json` wrote; masks are not in the file. Raises PromptError where it is something else."""
+    try:
+        return [_estimate_from_dict(entry) for entry in json.loads(text)["estimates"]]
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise PromptError(
+            f"this is no posekit result ({_why(error)}): give a result.json of posekit estimate."
+        ) from error
+
+
+def _why(error: Exception) -> str:
+    return f"it has no {error.args[0]}" if isinstance(error, KeyError) else str(error)
+
+
+def _estimate_to_dict(estimate: Estimate) -> dict[str, Any]:
+    found = estimate.detection
+    return {
+        "model": estimate.model,
+        "T_cam_obj": estimate.T_cam_obj.matrix.tolist(),
+        "quat_wxyz": estimate.T_cam_obj.quat_wxyz.tolist(),
+        "t_m": estimate.T_cam_obj.t.tolist(),
+        "angle_deg": math.degrees(estimate.angle),
+        "iterations": estimate.iterations,
+        "converged": estimate.converged,
+        "score": estimate.score,
+        "box": list(estimate.box),
+        "detection": found
+        and {"box": list(found.box), "score": found.score, "label": found.label, "source": found.source},
+        "trace": [
+            {"T_cam_obj": step.T_cam_obj.matrix.tolist(), "angle_deg": math.degrees(step.angle)}
+            for step in estimate.trace
+        ],
+        "timings_s": dict(estimate.timings),
+    }
+
+
+def _estimate_from_dict(entry: Mapping[str, Any]) -> Estimate:
+    found = entry["detection"]
+    return Estimate(
+        T_cam_obj=Pose.from_matrix(entry["T_cam_obj"]),
+        angle=_radians(entry["angle_deg"]),
+        iterations=int(entry["iterations"]),
+        converged=bool(entry["converged"]),
+        score=_number(entry["score"]),
+        box=_box(entry["box"]),
+        model=entry["model"],
+        detection=found
+        and Detection(_box(found["box"]), None, _number(found["score"]), found["label"], found["source"]),
+        trace=tuple(Step(Pose.from_matrix(s["T_cam_obj"]), _radians(s["angle_deg"])) for s in entry["trace"]),
+        timings={stage: _number(seconds) for stage, seconds in entry["timings_s"].items()},
+    )
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)
+
+
+def _radians(degrees: float | None) -> float:
+    return math.radians(_number(degrees))
+
+
+def _box(values: Sequence[float | None]) -> Box:
+    x0, y0, x1, y1 = map(_number, values)
+    return x0, y0, x1, y1
+
+
+def _strict(value: Any) -> Any:
+    """The value with NumPy's scalars and arrays as Python's, and None for NaN and infinities, which JSON lacks."""
+    if isinstance(value, Mapping):
+        return {str(key): _strict(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return _strict(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [_strict(item) for item in value]
+    if isinstance(value, np.generic):
+        return _strict(value.item())
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

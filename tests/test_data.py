@@ -1,0 +1,129 @@
+"""The data engine: what a pair says is true, augmentation does not change it, and a seed gives the same stream."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from objects import bracket
+
+from posekit.data.augment import AugmentConfig, augment, disturb_mask
+from posekit.data.pairs import Pair, PairConfig, render_pairs, stack_statistics
+from posekit.data.procedural import random_object, random_texture
+from posekit.data.stream import PairStream, StreamConfig, load_photos
+from posekit.geometry import quat_to_rotation, rotation_angle
+from posekit.render import Light, Renderer
+
+
+@pytest.fixture(scope="module")
+def pairs() -> list[Pair]:
+    return render_pairs(Renderer(), bracket(), 40, PairConfig(), np.random.default_rng(0))
+
+
+def test_the_flow_leads_to_the_same_paint(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the flow says that a seen anchor goes, the target shows the colour that the source shows."""
+    monkeypatch.setattr("posekit.data.pairs.random_light", lambda rng: Light(ambient=0.9, diffuse=0.1, specular=0.0))
+    hues = []
+    for pair in render_pairs(Renderer(), bracket(), 30, PairConfig(), np.random.default_rng(0)):
+        if pair.lost:
+            continue
+        rows, columns = np.nonzero(pair.seen)
+        place = np.rint(np.stack([columns, rows], 1) * 4 + 2 + pair.flow[rows, columns]).astype(int)
+        a = pair.source[rows * 4 + 2, columns * 4 + 2, :3].astype(float)
+        b = pair.target[place[:, 1], place[:, 0], :3].astype(float)
+        assert (pair.target[place[:, 1], place[:, 0], 3] == 255).all()
+        hues.append((a / a.sum(1, keepdims=True)) - (b / b.sum(1, keepdims=True)))
+    far = np.abs(np.concatenate(hues)).max(1) > 0.12
+    assert far.mean() < 0.05, "only pixels at the border of two colours may differ"
+
+
+def test_pairs_are_what_their_numbers_say(pairs: list[Pair]) -> None:
+    lost = [p for p in pairs if p.lost]
+    assert 1 <= len(lost) <= 12
+    assert all(p.angle >= np.deg2rad(25) for p in lost)
+    for p in pairs:
+        assert rotation_angle(quat_to_rotation(p.quat_wxyz)) == pytest.approx(p.angle, abs=1e-3)
+        assert p.valid.any() and p.quat_wxyz[0] >= 0 and not (p.seen & ~p.valid).any()
+        # the source's centre is the crop's: its silhouette reaches the middle's neighbourhood on both sides
+        columns = np.flatnonzero((p.source[..., 3] > 0).any(0))
+        assert columns[0] < 80 < columns[-1]
+    quat, v = stack_statistics(pairs)
+    assert len(quat) == len(v) == len(pairs) - len(lost)
+
+
+def test_augmentation_keeps_the_truth(pairs: list[Pair]) -> None:
+    rng = np.random.default_rng(5)
+    for pair in pairs[:10]:
+        sample = augment(pair, pairs, [], AugmentConfig(), rng)
+        assert sample.pair is pair and sample.rendered is pair.source
+        assert sample.observed.shape == pair.target.shape and sample.observed.dtype == np.uint8
+        assert not (sample.visible & ~pair.seen).any(), "nothing becomes visible"
+
+
+def test_without_augmentation_the_object_stays_where_it_is(pairs: list[Pair]) -> None:
+    config = AugmentConfig(clutter=0, occluded=0, shrink=1, dilate=0, no_mask=0, box_mask=0, cut_mask=0)
+    rng = np.random.default_rng(6)
+    overlaps = []
+    for pair in pairs[:10]:
+        mask = augment(pair, [], [], config, rng).observed[..., 3] > 0
+        true = pair.target[..., 3] > 0
+        overlaps.append((mask & true).sum() / (mask | true).sum())
+    assert np.median(overlaps) > 0.9
+
+
+@pytest.mark.parametrize(
+    "config, check",
+    [
+        (AugmentConfig(no_mask=1), lambda out, mask: not out.any()),
+        (AugmentConfig(no_mask=0, box_mask=1), lambda out, mask: out.sum() == 30 * 40 and out[mask].all()),
+    ],
+)
+def test_masks_go_wrong_as_told(config: AugmentConfig, check) -> None:  # type: ignore[no-untyped-def]
+    mask = np.zeros((120, 160), bool)
+    mask[40:70, 60:100] = True
+    mask[50:60, 70:80] = False
+    assert check(disturb_mask(mask, config, np.random.default_rng(0)), mask)
+
+
+def test_procedural_objects_are_valid_and_various() -> None:
+    rng = np.random.default_rng(7)
+    objects = [random_object(rng) for _ in range(30)]
+    for o in objects:
+        assert np.isfinite(o.vertices).all() and 0.03 < o.diameter < 0.32
+        assert np.abs(np.linalg.norm(o.normals, axis=1) - 1).max() < 1e-3
+    assert {o.texture is None for o in objects} == {True, False}
+    assert len({len(o.vertices) for o in objects}) > 5
+    texture = random_texture(rng)
+    assert texture.shape == (256, 256, 3) and texture.dtype == np.uint8
+
+
+def small(**changes: int) -> StreamConfig:
+    return StreamConfig(**{"batch": 4, "pool": 32, "per_object": 4, "objects": 4, **changes})
+
+
+def test_a_seed_gives_the_same_batches() -> None:
+    first, again, other = (iter(PairStream(small(), seed)) for seed in (1, 1, 2))
+    for _ in range(3):
+        a, b, c = next(first), next(again), next(other)
+        assert set(a) == {"observed", "rendered", "flow", "valid", "visible", "quat_wxyz", "v", "angle", "lost"}
+        assert all(torch.equal(a[k], b[k]) for k in a)
+        assert not torch.equal(a["observed"], c["observed"])
+    assert a["observed"].shape == (4, 120, 160, 4) and a["flow"].shape == (4, 2, 30, 40)
+
+
+def test_the_users_meshes_are_what_is_drawn() -> None:
+    stream = PairStream(small(), 0, models=[bracket()])
+    batch = next(iter(stream))
+    assert batch["valid"].any(dim=(1, 2)).all()
+
+
+def test_photos_are_read_and_others_left(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "b.png"), np.full((1000, 2000, 3), (255, 0, 0), np.uint8))
+    (tmp_path / "a.jpg").write_bytes(b"no picture")
+    (tmp_path / "c.txt").write_text("neither")
+    photos = load_photos(tmp_path)
+    assert [p.shape for p in photos] == [(400, 800, 3)] and tuple(photos[0][0, 0]) == (0, 0, 255)
+    assert load_photos(None) == []
