@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from posekit.camera import Box, Camera
 from posekit.geometry import Pose
@@ -32,10 +32,10 @@ def contour(image: Image, mask: Mask, colour: Colour = GREEN) -> Image:
     outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     width = _line_width(image)
     out = cv2.drawContours(image.copy(), outlines, -1, BLACK, width + 2, cv2.LINE_AA)
-    return _image(cv2.drawContours(out, outlines, -1, colour, width, cv2.LINE_AA))
+    return cv2.drawContours(out, outlines, -1, colour, width, cv2.LINE_AA)
 
 
-def axes(image: Image, camera: Camera, T_cam_obj: Pose, length: float, origin: Sequence[float] = (0, 0, 0)) -> Image:
+def axes(image: Image, camera: Camera, T_cam_obj: Pose, length: float, origin: ArrayLike = (0, 0, 0)) -> Image:
     """The object's x (red), y (green) and z (blue) axis, the farthest drawn first.
 
     length: metres. origin: (3,) metres in the object's frame, where the axes start. An axis that begins or ends
@@ -59,7 +59,7 @@ def axes(image: Image, camera: Camera, T_cam_obj: Pose, length: float, origin: S
 def box(image: Image, edges: Box, colour: Colour = ORANGE) -> Image:
     """A box given by its edges; its line runs along the outermost pixels inside it."""
     x0, y0, x1, y1 = (round(v) for v in edges)
-    return _image(cv2.rectangle(image.copy(), (x0, y0), (x1 - 1, y1 - 1), colour, _line_width(image)))
+    return cv2.rectangle(image.copy(), (x0, y0), (x1 - 1, y1 - 1), colour, _line_width(image))
 
 
 def caption(image: Image, text: str, colour: Colour = WHITE) -> Image:
@@ -72,7 +72,7 @@ def caption(image: Image, text: str, colour: Colour = WHITE) -> Image:
     bar = min(height, text_height + below + 4)
     out = image.copy()
     out[:bar] = (out[:bar] * 0.35).astype(np.uint8)
-    return _image(cv2.putText(out, text, (3, text_height + 2), FONT, size, colour, 1, cv2.LINE_AA))
+    return cv2.putText(out, text, (3, text_height + 2), FONT, size, colour, 1, cv2.LINE_AA)
 
 
 def grid(images: Sequence[Image], columns: int | None = None, captions: Sequence[str] = (), gap: int = 4) -> Image:
@@ -119,7 +119,7 @@ def stack(images: Sequence[Image], gap: int = 4) -> Image:
 def fit(image: Image, size: tuple[int, int]) -> Image:
     """A picture resized to (width, height), averaged where it shrinks."""
     shrinks = size[0] < image.shape[1]
-    return _image(cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
 
 
 def png(image: Image | Mask) -> bytes:
@@ -145,8 +145,3 @@ def _pixel(point: NDArray[np.float64]) -> tuple[int, int]:
 
 def _paper(height: int, width: int) -> Image:
     return np.full((height, width, 3), PAPER, dtype=np.uint8)
-
-
-def _image(array: object) -> Image:
-    """What OpenCV returns, with the type that its stubs leave open."""
-    return np.asarray(array, dtype=np.uint8)

@@ -19,7 +19,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 
 from posekit.camera import Box, Camera
 from posekit.errors import CameraError, ImageError, InputError, PromptError
-from posekit.geometry import Pose
+from posekit.geometry import Pose, nearest_rotation
 from posekit.view import View
 
 log = logging.getLogger("posekit")
@@ -82,10 +82,11 @@ def load_image(path: str | Path) -> NDArray[np.uint8]:
         return _rgb(ImageOps.exif_transpose(image), path.name)
 
 
-def load_mask(path: str | Path, size: Size | None = None) -> NDArray[np.bool_]:
+def load_mask(path: str | Path, size: Size | None = None, *, allow_empty: bool = False) -> NDArray[np.bool_]:
     """A mask (H, W) from a picture: True where a pixel is not black (and not transparent).
 
-    size: (width, height) that it must have. Raises PromptError where it has another, is empty, or is no picture.
+    size: (width, height) that it must have. Raises PromptError where it has another, is no picture, or is empty and
+    may not be.
     """
     path = Path(path)
     with _opened(path, "mask", PromptError) as image:
@@ -95,7 +96,7 @@ def load_mask(path: str | Path, size: Size | None = None) -> NDArray[np.bool_]:
                 "a mask has the size of its picture."
             )
         mask = _covered(image)
-    if not mask.any():
+    if not mask.any() and not allow_empty:
         raise PromptError(f"the mask {path.name} is empty: its pixels must be brighter than 0 where the object is.")
     return mask
 
@@ -149,7 +150,7 @@ def _rgb(image: Image.Image, label: str) -> NDArray[np.uint8]:
 
 def _covered(image: Image.Image) -> NDArray[np.bool_]:
     if image.mode in ("1", "L", "F") or image.mode.startswith("I"):
-        return np.asarray(image) != 0
+        return np.asarray(image).astype(np.bool_)
     layers = np.asarray(image.convert("RGBA"))
     return np.asarray(layers[..., :3].any(axis=2) & (layers[..., 3] > 0))
 
@@ -256,7 +257,8 @@ def _camera_from_text(content: str, path: Path, size: Size, image: str | Path | 
         return _camera_from_opencv(content, size)
     numbers = [float(part) for part in re.split(r"[\s,;\[\]]+", content) if part]
     if len(numbers) == 4:
-        return Camera(*numbers, *size)
+        fx, fy, cx, cy = numbers
+        return Camera(fx, fy, cx, cy, *size)
     return _from_matrix(numbers, size)
 
 
@@ -269,7 +271,8 @@ def _camera_from_json(data: Any, size: Size, image: str | Path | None) -> Camera
         return _camera_from_json(_entry_of_image(data, image), size, None)
     own = next(((int(data[w]), int(data[h])) for w, h in _SIZE_NAMES if data.get(w) and data.get(h)), size)
     if all(name in data for name in ("fx", "fy", "cx", "cy")):
-        return Camera(*(float(data[name]) for name in ("fx", "fy", "cx", "cy")), *own)
+        fx, fy, cx, cy = (float(data[name]) for name in ("fx", "fy", "cx", "cy"))
+        return Camera(fx, fy, cx, cy, *own)
     name = next((name for name in _MATRIX_NAMES if name in data), None)
     if name is None:
         raise ValueError(f"it has neither fx, fy, cx, cy nor any of {', '.join(_MATRIX_NAMES)}")
@@ -409,7 +412,12 @@ def _pose_from_dict(data: Any) -> Pose:
 
 
 def pose_from_bop(cam_R_m2c: Sequence[float], cam_t_m2c: Sequence[float]) -> Pose:
-    """``T_cam_obj`` in metres from BOP's nine numbers, row by row, and three in mm. Raises ValueError."""
+    """``T_cam_obj`` in metres from BOP's nine numbers, row by row, and three in mm. Raises ValueError.
+
+    LM-O's rotations of the driller are too large by 0.2 %: they are brought back to the nearest rotation.
+    """
     R = np.asarray(cam_R_m2c, dtype=np.float64).reshape(3, 3)
-    t = np.asarray(cam_t_m2c, dtype=np.float64).reshape(3, 1) / 1000.0
-    return Pose.from_matrix(np.hstack([R, t]))
+    t = np.asarray(cam_t_m2c, dtype=np.float64).reshape(3) / 1000.0
+    if not np.isfinite([*R.ravel(), *t]).all() or np.abs(R @ R.T - np.eye(3)).max() > 0.02 or np.linalg.det(R) < 0:
+        raise ValueError("cam_R_m2c is not a rotation, or cam_t_m2c not finite")
+    return Pose(nearest_rotation(R), t)

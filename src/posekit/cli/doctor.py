@@ -44,7 +44,9 @@ def doctor() -> None:
     console.print(table)
     problems = sum(finding.state == "problem" for finding in findings)
     if problems:
-        console.print(f"{problems} problem{'s' if problems > 1 else ''}: posekit cannot work here yet.", style="bold red")
+        console.print(
+            f"{problems} problem{'s' if problems > 1 else ''}: posekit cannot work here yet.", style="bold red"
+        )
         raise typer.Exit(1)
 
 

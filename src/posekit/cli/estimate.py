@@ -66,8 +66,8 @@ def estimate(
 
     from posekit.cli.prompts import detector_for
     from posekit.estimate import EstimateOptions, PoseEstimator
+    from posekit.load import load_view
     from posekit.object_model import ObjectModel
-    from posekit.view import load_view
 
     options = EstimateOptions(init, hypotheses, update, stop, iterations, stop_angle, seed)
     view = load_view(image, camera)
@@ -77,4 +77,4 @@ def estimate(
         estimator = PoseEstimator(mesh, preset=preset, weights=weights, options=options, threads=threads)
     with destination.working("estimating"):
         estimates = estimator.estimate(view, detections)
-    destination.deliver(estimator, view, estimates)
+    destination.deliver(estimator, view, estimates, {"image": image, "mesh": model})

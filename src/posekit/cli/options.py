@@ -45,9 +45,7 @@ MaskOption = Annotated[
     Path | None,
     typer.Option(metavar="PNG", help="The object's mask, of the photograph's size.", rich_help_panel=INPUT),
 ]
-MaskFromOption = Annotated[
-    MaskFrom, typer.Option(help="How a box becomes a mask.", rich_help_panel=INPUT)
-]
+MaskFromOption = Annotated[MaskFrom, typer.Option(help="How a box becomes a mask.", rich_help_panel=INPUT)]
 
 PresetOption = Annotated[str, typer.Option(help="The networks: lite or paper.", rich_help_panel=LOOP)]
 WeightsOption = Annotated[
@@ -59,9 +57,7 @@ StopOption = Annotated[
     Stop,
     typer.Option(help="At a predicted angle (the paper), or after a fixed number (DeepIM).", rich_help_panel=LOOP),
 ]
-IterationsOption = Annotated[
-    int, typer.Option(help="At most; with --stop fixed exactly.", rich_help_panel=LOOP)
-]
+IterationsOption = Annotated[int, typer.Option(help="At most; with --stop fixed exactly.", rich_help_panel=LOOP)]
 StopAngleOption = Annotated[
     float, typer.Option(metavar="DEGREES", help="Predicted angle that ends the loop.", rich_help_panel=LOOP)
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -67,8 +67,11 @@ class Destination:
 
     @classmethod
     def chosen(cls, out: Path | None, default: Path, force: bool, json: str | None) -> Destination:
-        if json is not None and json != "-" and Path(json).is_dir():
-            raise OutputError(f"--json {json} is a folder: give a file, or - for standard output.")
+        if json is not None and json != "-":
+            if Path(json).is_dir():
+                raise OutputError(f"--json {json} is a folder: give a file, or - for standard output.")
+            if not Path(json).parent.is_dir():
+                raise OutputError(f"--json {json}: there is no folder {Path(json).parent}. Make it first.")
         if out is None and json is not None:
             return cls(None, json)
         return cls(OutputFolder(out or default, force), json)
@@ -85,12 +88,17 @@ class Destination:
         with Console(stderr=True).status(f"{what} ..."):
             yield
 
-    def deliver(self, estimator: PoseEstimator, view: View, estimates: Sequence[Estimate]) -> None:
-        """Print the estimates and write them: the result as JSON, and the overlay."""
+    def deliver(
+        self, estimator: PoseEstimator, view: View, estimates: Sequence[Estimate], files: Mapping[str, Path]
+    ) -> None:
+        """Print the estimates and write them: the result as JSON, and the overlay.
+
+        files: what they were made from, by name, for the result.
+        """
         from posekit import draw
         from posekit.figures import overlay
 
-        result = _result(estimator, view, estimates)
+        result = _result(estimator, view, estimates, files)
         for estimate in estimates:
             self.say(describe(estimate))
         if not estimates:
@@ -118,11 +126,11 @@ def describe(estimate: Estimate) -> str:
     )
 
 
-def _result(estimator: PoseEstimator, view: View, estimates: Sequence[Estimate]) -> str:
+def _result(estimator: PoseEstimator, view: View, estimates: Sequence[Estimate], files: Mapping[str, Path]) -> str:
     camera = view.camera
     return estimates_to_json(
         estimates,
         weights_hash=estimator.weights_hash,
         versions={name: version(name) for name in ("torch", "numpy", "opencv-python-headless", "moderngl")},
-        about={"camera": {"K": camera.K, "width": camera.width, "height": camera.height}},
+        about={**files, "camera": {"K": camera.K, "width": camera.width, "height": camera.height}},
     )

@@ -79,4 +79,4 @@ def refine(
         estimator = PoseEstimator(mesh, preset=preset, weights=weights, options=options, threads=threads)
     with destination.working("refining"):
         refined = estimator.refine(view, start)
-    destination.deliver(estimator, view, [refined])
+    destination.deliver(estimator, view, [refined], {"image": image, "mesh": model})

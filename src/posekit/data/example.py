@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -63,9 +64,7 @@ def ply(model: ObjectModel) -> str:
     names = [f"property float {n}" for n in "xyz"] + [f"property uchar {n}" for n in ("red", "green", "blue")]
     head = ["ply", "format ascii 1.0", f"element vertex {len(model.vertices)}", *names]
     head += [f"element face {len(model.faces)}", "property list uchar int vertex_indices", "end_header"]
-    vertices = [
-        "{:.6f} {:.6f} {:.6f} {} {} {}".format(*p, *c) for p, c in zip(model.vertices, colours, strict=True)
-    ]
+    vertices = ["{:.6f} {:.6f} {:.6f} {} {} {}".format(*p, *c) for p, c in zip(model.vertices, colours, strict=True)]
     return "\n".join([*head, *vertices, *(f"3 {a} {b} {c}" for a, b, c in model.faces)]) + "\n"
 
 
@@ -90,8 +89,12 @@ def _body() -> Iterator[_Part]:
     for x in (0.008, 0.042):
         yield _turned([(0.0268, 0), (0.0268, 0.006)], "x", (x, 0, 0.062), GOLD)  # its bands
     yield _turned([(0, 0), (0.028, 0), (0.028, 0.016), (0.022, 0.020), (0, 0.020)], "x", (0.066, 0, 0.062), BLACK)
-    yield _turned([(0.008, 0), (0.008, 0.022), (0.015, 0.034), (0.011, 0.034), (0, 0.020)], "z", (0.056, 0, 0.084), BLACK)
-    yield _turned([(0.012, 0), (0.012, 0.008), (0.010, 0.014), (0.006, 0.018), (0, 0.019)], "z", (0.018, 0, 0.084), GOLD)
+    yield _turned(
+        [(0.008, 0), (0.008, 0.022), (0.015, 0.034), (0.011, 0.034), (0, 0.020)], "z", (0.056, 0, 0.084), BLACK
+    )
+    yield _turned(
+        [(0.012, 0), (0.012, 0.008), (0.010, 0.014), (0.006, 0.018), (0, 0.019)], "z", (0.018, 0, 0.084), GOLD
+    )
     yield _block((-0.086, -0.032, 0.036), (-0.020, 0.032, 0.106), BLUE)  # cab
     yield _block((-0.094, -0.037, 0.106), (-0.012, 0.037, 0.112), RED)  # roof
     for y in (-0.0325, 0.0315):
@@ -115,13 +118,13 @@ def _gear() -> Iterator[_Part]:
 def _clutter() -> ObjectModel:
     """What stands behind the locomotive, in the table's frame."""
     mug: Profile = [(0, 0), (0.038, 0), (0.040, 0.085), (0.036, 0.085), (0.034, 0.01), (0, 0.01)]
+    ball: Profile = [(0.045 * np.sin(a), -0.045 * np.cos(a)) for a in np.linspace(0, np.pi, 25)]
     parts = [
         _turned(mug, "z", (-0.19, 0.18, 0), (206, 202, 190)),
         _turned([(0.0403, 0.03), (0.0403, 0.05)], "z", (-0.19, 0.18, 0), (70, 120, 150)),
         _block((0.10, 0.14, 0), (0.32, 0.30, 0.028), (122, 54, 58)),
         _block((0.13, 0.15, 0.028), (0.30, 0.31, 0.046), (60, 92, 84)),
-        _turned([(0.045 * np.sin(a), -0.045 * np.cos(a)) for a in np.linspace(0, np.pi, 25)], "z", (0.02, 0.36, 0.045),
-                (214, 140, 44)),  # fmt: skip
+        _turned(ball, "z", (0.02, 0.36, 0.045), (214, 140, 44)),
         _turned([(0, 0), (0.005, 0), (0.005, 0.16), (0, 0.17)], "x", (-0.30, -0.02, 0.005), (208, 176, 40)),
     ]
     return _model("clutter", parts)
@@ -130,7 +133,8 @@ def _clutter() -> ObjectModel:
 def _block(low: Sequence[float], high: Sequence[float], colour: Colour) -> _Part:
     """A box between two corners; each face has its own vertices, so that its edges stay sharp."""
     square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-    corners, faces = [], []
+    corners: list[Array] = []
+    faces: list[NDArray[np.int64]] = []
     for axis in range(3):
         for end in (0, 1):
             face = np.insert(square, axis, end, axis=1)
@@ -152,7 +156,7 @@ def _turned(profile: Profile, axis: str, at: Sequence[float], colour: Colour, n:
     rings = [np.stack([r * np.cos(angle), r * np.sin(angle), np.full(n + 1, h)], 1) for r, h in profile]
     k = np.arange(n)
     strip = np.concatenate([np.stack([k, k + 1, k + n + 2], 1), np.stack([k, k + n + 2, k + n + 1], 1)])
-    bands = [np.concatenate(pair) for pair in zip(rings[:-1], rings[1:], strict=True)]
+    bands = [np.concatenate(pair) for pair in pairwise(rings)]
     faces = np.concatenate([strip + 2 * (n + 1) * band for band in range(len(bands))])
     order = {"x": [2, 0, 1], "y": [1, 2, 0], "z": [0, 1, 2]}[axis]  # cyclic: keeps the faces' sense
     vertices = np.concatenate(bands)[:, order]
@@ -167,7 +171,7 @@ def _model(name: str, parts: Sequence[_Part]) -> ObjectModel:
         np.concatenate([part.vertices for part in parts]).astype(np.float32),
         np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)]).astype(np.int32),
         name=name,
-        colors=np.concatenate([np.tile(np.uint8(part.colour), (len(part.vertices), 1)) for part in parts]),
+        colors=np.concatenate([np.full((len(part.vertices), 3), part.colour, np.uint8) for part in parts]),
     )
 
 

@@ -1,0 +1,256 @@
+"""Data sets in BOP layout, read as they lie on the disk. Millimetres become metres here."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from posekit.camera import Box, Camera
+from posekit.errors import CameraError, InputError, MeshError
+from posekit.geometry import Pose
+from posekit.load import load_image, load_mask, pose_from_bop
+from posekit.object_model import ObjectModel
+from posekit.view import View
+
+_PICTURES = (("rgb", ".png"), ("rgb", ".jpg"), ("gray", ".png"), ("gray", ".tif"))
+
+
+@dataclass(frozen=True, eq=False)
+class Instance:
+    """An annotated object in a photograph.
+
+    index: its number in the image's annotations. T_cam_obj: metres. box_obj: round the whole object, box_visib: round
+    what is seen of it; edges in pixels, None where it is outside the picture. visib_fract: in [0, 1].
+    mask_path: PNG of its visible pixels; the file may be missing.
+    Where the data set has no scene_gt_info.json, the boxes are None and visib_fract is NaN.
+    """
+
+    scene: int
+    image: int
+    index: int
+    obj_id: int
+    T_cam_obj: Pose
+    box_obj: Box | None
+    box_visib: Box | None
+    visib_fract: float
+    mask_path: Path
+
+    def mask(self) -> NDArray[np.bool_]:
+        """Its visible pixels, bool (H, W), all False where nothing is visible. Raises PromptError where the file is
+        missing or damaged."""
+        return load_mask(self.mask_path, allow_empty=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """What a test asks for: ``count`` instances of an object in an image."""
+
+    scene: int
+    image: int
+    obj_id: int
+    count: int
+
+
+class BopDataset:
+    """A folder in BOP layout: ``models/``, ``SPLIT/SCENE/{rgb, scene_camera.json, ...}``.
+
+    split: the folder with scenes. targets: a test's list of images and objects, by default the first
+    ``SPLIT_targets_*.json`` (bop19 before others) in the folder; where there is one, `images` and `instances` keep
+    to it. Pass ``targets=None`` to see everything. Raises InputError where the layout is not there.
+    """
+
+    def __init__(
+        self, root: str | Path, split: str = "test", targets: str | None = "auto", models: str = "models"
+    ) -> None:
+        self.root, self.split = Path(root), split
+        if not (self.root / split).is_dir():
+            raise InputError(
+                f"{self.root} has no folder {split!r}: a data set in BOP layout has models/ and {split}/000001/ and so "
+                "on. Check the path and the split."
+            )
+        self._models = self.root / models
+        self._targets_file = self._find_targets(targets)
+        self._loaded: dict[int, ObjectModel] = {}
+        self._scenes: dict[int, _Scene] = {}
+
+    # --- what there is ---
+
+    def model_ids(self) -> list[int]:
+        """The objects' numbers. Raises MeshError where there are no models."""
+        found = sorted(int(path.stem[4:]) for path in self._models.glob("obj_*.ply") if path.stem[4:].isdigit())
+        if not found:
+            raise MeshError(f"there are no meshes {self._models}/obj_000001.ply and so on: get the data set's models.")
+        return found
+
+    def model(self, obj_id: int) -> ObjectModel:
+        """An object's mesh in metres; loaded once."""
+        if obj_id not in self._loaded:
+            path = self._models / f"obj_{obj_id:06d}.ply"
+            if not path.is_file():
+                raise MeshError(f"there is no mesh {path} for object {obj_id}; there are {self.model_ids()}.")
+            self._loaded[obj_id] = ObjectModel.load(path, units="mm")
+        return self._loaded[obj_id]
+
+    def scenes(self) -> list[int]:
+        """The scenes' numbers."""
+        folders = (self.root / self.split).iterdir()
+        return sorted(int(path.name) for path in folders if path.is_dir() and path.name.isdigit())
+
+    def images(self, scene: int | None = None) -> list[tuple[int, int]]:
+        """(scene, image) of all photographs, or of one scene's, in order: the targets', where there are targets."""
+        scenes = self.scenes() if scene is None else [scene]
+        if self.targets is not None:
+            return sorted({(t.scene, t.image) for t in self.targets if t.scene in scenes})
+        return [(s, image) for s in scenes for image in sorted(self._scene(s).cameras)]
+
+    @cached_property
+    def targets(self) -> list[Target] | None:
+        """The targets file's entries; None without one."""
+        if self._targets_file is None:
+            return None
+        try:
+            entries = _json(self._targets_file)
+            return [Target(e["scene_id"], e["im_id"], e["obj_id"], e["inst_count"]) for e in entries]
+        except (KeyError, TypeError) as error:
+            raise InputError(
+                f"{self._targets_file} is no list of targets with scene_id, im_id, obj_id and inst_count: {error!r}."
+            ) from error
+
+    # --- what is in a photograph ---
+
+    def view(self, scene: int, image: int) -> View:
+        """A photograph with its own camera."""
+        pixels = load_image(self.image_path(scene, image))
+        return View(pixels, self.camera(scene, image, (pixels.shape[1], pixels.shape[0])))
+
+    def image_path(self, scene: int, image: int) -> Path:
+        """Where a photograph lies. Raises InputError where it is missing."""
+        folder = self._scene(scene).folder
+        candidates = [folder / kind / f"{image:06d}{suffix}" for kind, suffix in _PICTURES]
+        found = next((path for path in candidates if path.is_file()), None)
+        if found is None:
+            raise InputError(
+                f"there is no photograph {candidates[0]}: image {image} of scene {scene} is not in this copy."
+            )
+        return found
+
+    def camera(self, scene: int, image: int, size: tuple[int, int]) -> Camera:
+        """A photograph's camera; size: (width, height). Raises CameraError."""
+        here = self._scene(scene)
+        if image not in here.cameras:
+            raise CameraError(f"{here.folder}/scene_camera.json has no camera for image {image}.")
+        return Camera.from_K(here.cameras[image]["cam_K"], *size)
+
+    def instances(self, scene: int, image: int, every: bool = False) -> list[Instance]:
+        """The annotated objects in a photograph, in the file's order.
+
+        Where there are targets, only the objects that they name, as many of each as they ask for, the most visible
+        ones; with ``every`` all of them.
+        """
+        here = self._scene(scene)
+        if image not in here.truths:
+            raise InputError(f"{here.folder}/scene_gt.json has no annotations for image {image}.")
+        truths = here.truths[image]
+        infos = here.infos.get(image, []) if here.infos is not None else [None] * len(truths)
+        if len(infos) != len(truths):
+            raise InputError(
+                f"{here.folder}/scene_gt_info.json has {len(infos)} entries for image {image}, scene_gt.json "
+                f"{len(truths)}: they belong together. Get both from the same copy of the data set."
+            )
+        found = [_instance(here, scene, image, k, truths[k], infos[k]) for k in range(len(truths))]
+        return found if every or self.targets is None else self._wanted(found)
+
+    def _wanted(self, found: list[Instance]) -> list[Instance]:
+        kept: set[int] = set()
+        for target in self.targets or ():
+            same = [i for i in found if (i.scene, i.image, i.obj_id) == (target.scene, target.image, target.obj_id)]
+            same.sort(key=lambda i: -i.visib_fract)
+            kept.update(i.index for i in same[: target.count])
+        return [i for i in found if i.index in kept]
+
+    def _scene(self, scene: int) -> _Scene:
+        if scene not in self._scenes:
+            folder = self.root / self.split / f"{scene:06d}"
+            if not folder.is_dir():
+                raise InputError(f"there is no scene {folder}; there are {self.scenes()}.")
+            self._scenes[scene] = _Scene(folder)
+        return self._scenes[scene]
+
+    def _find_targets(self, targets: str | None) -> Path | None:
+        if targets is None:
+            return None
+        if targets != "auto":
+            path = self.root / targets
+            if not path.is_file():
+                raise InputError(f"there is no targets file {path}: check its name, or pass targets=None.")
+            return path
+        found = sorted(self.root.glob(f"{self.split}_targets_*.json"))
+        return next((path for path in found if path.stem.endswith("bop19")), found[0] if found else None)
+
+
+class _Scene:
+    """A scene's files, each read when it is first needed."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    @cached_property
+    def cameras(self) -> dict[int, Any]:
+        return self._numbered("scene_camera.json")
+
+    @cached_property
+    def truths(self) -> dict[int, Any]:
+        return self._numbered("scene_gt.json")
+
+    @cached_property
+    def infos(self) -> dict[int, Any] | None:
+        name = "scene_gt_info.json"
+        return self._numbered(name) if (self.folder / name).exists() else None
+
+    def _numbered(self, name: str) -> dict[int, Any]:
+        data = _json(self.folder / name)
+        if not isinstance(data, dict) or not all(key.isdigit() for key in data):
+            raise InputError(f"{self.folder / name} does not map image numbers to entries, as BOP's files do.")
+        return {int(key): value for key, value in data.items()}
+
+
+def _instance(
+    scene: _Scene, scene_id: int, image: int, index: int, truth: Mapping[str, Any], info: Mapping[str, Any] | None
+) -> Instance:
+    try:
+        return Instance(
+            scene=scene_id,
+            image=image,
+            index=index,
+            obj_id=int(truth["obj_id"]),
+            T_cam_obj=pose_from_bop(truth["cam_R_m2c"], truth["cam_t_m2c"]),
+            box_obj=None if info is None else _box(info["bbox_obj"]),
+            box_visib=None if info is None else _box(info["bbox_visib"]),
+            visib_fract=math.nan if info is None else float(info["visib_fract"]),
+            mask_path=scene.folder / "mask_visib" / f"{image:06d}_{index:06d}.png",
+        )
+    except (KeyError, ValueError, TypeError) as error:
+        raise InputError(f"annotation {index} of image {image} in {scene.folder} is not BOP's: {error!r}.") from error
+
+
+def _box(xywh: Any) -> Box | None:
+    """BOP's (x, y, w, h) as edges; None for its (-1, -1, -1, -1)."""
+    x, y, w, h = (float(v) for v in xywh)
+    return (x, y, x + w, y + h) if w > 0 and h > 0 else None
+
+
+def _json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise InputError(f"there is no file {path}: this copy of the data set is not complete.") from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read: {error}.") from error

@@ -1,0 +1,542 @@
+"""Meshes from files of every kind, their units, symmetries, normals, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from posekit.errors import MeshError
+from posekit.geometry import Pose, random_rotation, rotation_angle
+from posekit.object_model import ObjectModel, Symmetries, smooth_normals
+
+BOX = trimesh.creation.box((0.10, 0.06, 0.04))
+CORNERS = np.asarray(BOX.vertices) + (0.3, 0.0, -0.1)  # its origin is far from its centre
+FACES = np.asarray(BOX.faces)
+COLOURS = np.arange(24).reshape(8, 3).astype(np.uint8) * 10
+
+
+def write_ply(
+    path: Path, vertices: np.ndarray, faces: list | np.ndarray, colours: bool = False, head: str = ""
+) -> Path:
+    """An ASCII PLY; with colours, those of COLOURS."""
+    names = "property float x\nproperty float y\nproperty float z\n"
+    rows = [" ".join(f"{x:.7g}" for x in v) for v in vertices]
+    if colours:
+        names += "".join(f"property uchar {c}\n" for c in ("red", "green", "blue"))
+        rows = [f"{row} {r} {g} {b}" for row, (r, g, b) in zip(rows, COLOURS, strict=True)]
+    rows += [" ".join(map(str, [len(f), *f])) for f in faces]
+    path.write_text(
+        f"ply\nformat ascii 1.0\n{head}element vertex {len(vertices)}\n{names}element face {len(faces)}\n"
+        "property list uchar int vertex_indices\nend_header\n" + "\n".join(rows) + "\n"
+    )
+    return path
+
+
+def write_obj(path: Path, texture: str = "skin.png") -> Path:
+    """A textured quadrilateral and one more triangle, with an uv seam along the middle edge."""
+    path.write_text(
+        f"mtllib {path.stem}.mtl\nusemtl skin\n"
+        "v 0 0 0\nv 0.1 0 0\nv 0.1 0.1 0\nv 0 0.1 0\nv 0.2 0 0\n"
+        "vt 0 0\nvt 0.5 0\nvt 0.5 1\nvt 0 1\nvt 1 0\nvt 0.75 0\nvt 0.75 1\n"
+        "f 1/1 2/2 3/3\nf 1/1 3/3 4/4\nf 2/6 5/5 3/7\n"
+    )
+    path.with_suffix(".mtl").write_text(f"newmtl skin\nKd 0 0 0\nmap_Kd {texture}\n")
+    return path
+
+
+def picture(path: Path) -> np.ndarray:
+    """A picture whose top left quarter is red and bottom right quarter is blue."""
+    pixels = np.zeros((16, 32, 3), np.uint8)
+    pixels[:8, :16] = (255, 0, 0)
+    pixels[8:, 16:] = (0, 0, 255)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(pixels).save(path)
+    return pixels
+
+
+def sample(model: ObjectModel, uv: np.ndarray) -> np.ndarray:
+    """The texture's colours at uvs (N, 2), v up, as OpenGL finds them."""
+    assert model.texture is not None
+    height, width = model.texture.shape[:2]
+    x = np.floor((uv[:, 0] % 1) * width).astype(int)
+    y = np.floor((1 - uv[:, 1] % 1) * height).astype(int).clip(max=height - 1)
+    return model.texture[y, x]
+
+
+def face_colours(model: ObjectModel) -> np.ndarray:
+    """The texture's colour in the middle of each face."""
+    assert model.uvs is not None
+    return sample(model, model.uvs[model.faces].mean(axis=1))
+
+
+# --- formats ---
+
+
+def test_ascii_ply_with_colours_keeps_its_origin(tmp_path: Path) -> None:
+    model = ObjectModel.load(write_ply(tmp_path / "box.ply", CORNERS * 1000, FACES, colours=True))
+    assert (model.name, model.units) == ("box", "mm")
+    np.testing.assert_allclose(model.center, [0.3, 0, -0.1], atol=1e-6)
+    np.testing.assert_allclose(model.extents, [0.10, 0.06, 0.04], atol=1e-6)
+    assert model.diameter == pytest.approx(np.linalg.norm([0.10, 0.06, 0.04]), rel=1e-5)
+    np.testing.assert_allclose(model.T_obj_ctr.t, model.center)
+    assert model.colors is not None
+    for point, colour in zip(model.vertices, model.colors, strict=True):  # each colour stays with its corner
+        corner = np.linalg.norm(CORNERS - point, axis=1).argmin()
+        np.testing.assert_array_equal(colour, COLOURS[corner])
+    assert (model.vertices.dtype, model.faces.dtype, model.normals.dtype) == (np.float32, np.int32, np.float32)
+
+
+@pytest.mark.parametrize("suffix", ["ply", "stl", "glb", "obj"])
+def test_what_trimesh_writes_is_read(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"box.{suffix}"
+    trimesh.Trimesh(CORNERS, FACES, process=False).export(path)
+    model = ObjectModel.load(path)
+    np.testing.assert_allclose(model.center, [0.3, 0, -0.1], atol=1e-6)
+    assert len(model.faces) == 12
+    assert model.units == "m"
+    assert model.texture is None
+
+
+def test_binary_ply_with_colours(tmp_path: Path) -> None:
+    trimesh.Trimesh(CORNERS, FACES, vertex_colors=COLOURS, process=False).export(tmp_path / "box.ply")
+    model = ObjectModel.load(tmp_path / "box.ply")
+    assert model.colors is not None
+    np.testing.assert_array_equal(np.unique(model.colors, axis=0), np.unique(COLOURS, axis=0))
+
+
+def test_quadrilaterals_become_triangles(tmp_path: Path) -> None:
+    quads = [(0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5)]
+    assert len(ObjectModel.load(write_ply(tmp_path / "q.ply", CORNERS, quads)).faces) == 5
+
+
+def test_the_files_normals_are_kept_and_made_unit(tmp_path: Path) -> None:
+    normals = (CORNERS - CORNERS.mean(axis=0)) * 50
+    path = tmp_path / "n.ply"
+    trimesh.Trimesh(CORNERS, FACES, vertex_normals=normals, process=False).export(path, vertex_normal=True)
+    model = ObjectModel.load(path)
+    assert len(model.vertices) == 8
+    np.testing.assert_allclose(model.normals, normals / np.linalg.norm(normals, axis=1, keepdims=True), atol=1e-5)
+
+
+def test_obj_with_a_texture_and_an_uv_seam(tmp_path: Path) -> None:
+    pixels = picture(tmp_path / "maps" / "skin.png")
+    model = ObjectModel.load(write_obj(tmp_path / "thing.obj", r"maps\skin.png"))
+    assert model.texture is not None
+    assert model.uvs is not None
+    np.testing.assert_array_equal(model.texture, pixels)
+    assert model.colors is None
+    assert len(model.vertices) == 7  # the seam's two corners lie there twice
+    top_left = model.uvs[np.linalg.norm(model.vertices - (0, 0.1, 0), axis=1).argmin()]
+    np.testing.assert_allclose(top_left, [0, 1])
+    np.testing.assert_array_equal(sample(model, np.array([[0.01, 0.99], [0.99, 0.01]])), [[255, 0, 0], [0, 0, 255]])
+    np.testing.assert_allclose(model.normals, np.tile([0, 0, 1], (7, 1)), atol=1e-6)  # smooth across the seam
+
+
+def test_mtl_options_before_the_pictures_name(tmp_path: Path) -> None:
+    picture(tmp_path / "skin.png")
+    assert ObjectModel.load(write_obj(tmp_path / "thing.obj", "-s 1 1 1 skin.png")).texture is not None
+
+
+def test_a_material_without_a_picture_gives_one_colour(tmp_path: Path) -> None:
+    path = write_obj(tmp_path / "thing.obj")
+    path.with_suffix(".mtl").write_text("newmtl skin\nKd 1 0.5 0\n")
+    model = ObjectModel.load(path)
+    assert model.colors is not None
+    np.testing.assert_allclose(model.colors, np.tile([255, 127.5, 0], (7, 1)), atol=1)
+
+
+def test_textured_ply(tmp_path: Path) -> None:
+    pixels = picture(tmp_path / "skin.png")
+    path = tmp_path / "plate.ply"
+    path.write_text(
+        "ply\nformat ascii 1.0\ncomment TextureFile skin.png\nelement vertex 4\n"
+        "property float x\nproperty float y\nproperty float z\nproperty float nx\nproperty float ny\n"
+        "property float nz\nproperty float texture_u\nproperty float texture_v\n"
+        "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+        "0.1 0.1 0 0 0.6 0.8 1 1\n0 0 0 0 0 1 0 0\n0.1 0 0 0.6 0 0.8 1 0\n0 0.1 0 0 0 1 0 1\n3 1 2 0\n3 1 0 3\n"
+    )
+    model = ObjectModel.load(path)
+    assert model.texture is not None
+    assert model.uvs is not None
+    np.testing.assert_array_equal(model.texture, pixels)
+    np.testing.assert_allclose(model.uvs, model.vertices[:, :2] * 10, atol=1e-6)
+    lower_right = np.linalg.norm(model.vertices - (0.1, 0, 0), axis=1).argmin()
+    np.testing.assert_allclose(model.normals[lower_right], [0.6, 0, 0.8], atol=1e-6)  # stays with its vertex
+
+
+def test_ply_with_texture_coordinates_but_no_texture_keeps_its_colours(tmp_path: Path) -> None:
+    path = tmp_path / "plate.ply"
+    path.write_text(
+        "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+        "property uchar red\nproperty uchar green\nproperty uchar blue\nproperty float s\nproperty float t\n"
+        "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+        "0 0 0 10 20 30 0 0\n0.1 0 0 10 20 30 1 0\n0.1 0.1 0 10 20 30 1 1\n0 0.1 0 10 20 30 0 1\n3 0 1 2\n3 0 2 3\n"
+    )
+    model = ObjectModel.load(path)
+    assert model.texture is None
+    np.testing.assert_array_equal(model.colors, np.tile([10, 20, 30], (4, 1)))
+
+
+def quad(colour_or_image: object, shift: float = 0.0, repeats: float = 1.0) -> trimesh.Trimesh:
+    vertices = np.array([[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]]) + (shift, 0, 0)
+    uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * repeats
+    if isinstance(colour_or_image, np.ndarray):
+        material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(colour_or_image))
+    else:
+        material = trimesh.visual.material.PBRMaterial(baseColorFactor=colour_or_image)
+        uv = None
+    visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    return trimesh.Trimesh(vertices, [[0, 1, 2], [0, 2, 3]], visual=visual, process=False)
+
+
+def plain_picture(colour: tuple[int, int, int], size: tuple[int, int] = (40, 60)) -> np.ndarray:
+    return np.tile(np.array(colour, np.uint8), (*size, 1))
+
+
+def test_glb_nodes_are_placed_and_their_textures_share_one(tmp_path: Path) -> None:
+    scene = trimesh.Scene()
+    move = np.eye(4)
+    move[:3, 3] = (0, 0, 0.5)
+    half = plain_picture((0, 200, 0))
+    half[:20] = (200, 200, 0)  # the upper half
+    scene.add_geometry(quad(plain_picture((200, 0, 0)), 0.0), geom_name="a")
+    scene.add_geometry(quad(half, 0.2), geom_name="b", transform=move)
+    scene.add_geometry(quad((0, 0, 255, 255), 0.4), geom_name="c")
+    scene.export(tmp_path / "scene.glb")
+    model = ObjectModel.load(tmp_path / "scene.glb")
+    middles = model.vertices[model.faces].mean(axis=1)
+    colours = face_colours(model)
+    for middle, colour in zip(middles, colours, strict=True):
+        if middle[0] < 0.15:
+            expected, z = (200, 0, 0), 0.0
+        elif middle[0] < 0.35:
+            expected, z = (200, 200, 0) if middle[1] > 0.05 else (0, 200, 0), 0.5
+        else:
+            expected, z = (0, 0, 255), 0.0
+        np.testing.assert_allclose(colour, expected, atol=1)
+        assert middle[2] == pytest.approx(z)
+
+
+def test_repeated_textures_survive_the_atlas(tmp_path: Path) -> None:
+    checks = plain_picture((250, 250, 250), (8, 8))
+    checks[:4, :4] = checks[4:, 4:] = 0
+    scene = trimesh.Scene([quad(checks, 0.0, repeats=3.0), quad(plain_picture((200, 0, 0)), 0.2)])
+    scene.export(tmp_path / "scene.glb")
+    model = ObjectModel.load(tmp_path / "scene.glb")
+    assert model.uvs is not None
+    assert model.uvs.min() >= 0
+    assert model.uvs.max() <= 1
+    corners = model.uvs[(model.vertices[:, 0] < 0.15)]
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    inside = low + (high - low) * np.array([[1 / 12, 1 / 12], [3 / 12, 1 / 12], [5 / 12, 1 / 12], [11 / 12, 11 / 12]])
+    np.testing.assert_array_equal(sample(model, inside)[:, 0] > 100, [True, False, True, True])
+
+
+def test_a_mirrored_node_is_not_turned_inside_out(tmp_path: Path) -> None:
+    mirror = np.diag([-1.0, 1, 1, 1])
+    scene = trimesh.Scene()
+    scene.add_geometry(trimesh.Trimesh(CORNERS, FACES, process=False), transform=mirror)
+    scene.export(tmp_path / "m.glb")
+    model = ObjectModel.load(tmp_path / "m.glb")
+    np.testing.assert_allclose(model.center, [-0.3, 0, -0.1], atol=1e-6)
+    middles = model.vertices[model.faces].mean(axis=1) - model.center
+    corners = model.vertices[model.faces]
+    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (np.einsum("ij,ij->i", middles, outward) > 0).all()
+    assert (np.einsum("ij,ij->i", model.vertices - model.center, model.normals) > 0).all()
+
+
+def test_textured_and_vertex_coloured_parts_do_not_mix(tmp_path: Path) -> None:
+    coloured = trimesh.Trimesh(CORNERS, FACES, vertex_colors=COLOURS, process=False)
+    trimesh.Scene([quad(plain_picture((200, 0, 0))), coloured]).export(tmp_path / "s.glb")
+    with pytest.raises(MeshError, match="bake them into one texture"):
+        ObjectModel.load(tmp_path / "s.glb")
+
+
+# --- geometry ---
+
+
+def test_degenerate_faces_and_stray_vertices_are_dropped(tmp_path: Path) -> None:
+    vertices = np.vstack([CORNERS, [[9, 9, 9]]])
+    faces = np.vstack([FACES, [[0, 0, 1]]])
+    model = ObjectModel.load(write_ply(tmp_path / "box.ply", vertices, faces), units="m")
+    assert len(model.faces) == 12
+    assert model.vertices.max() < 1
+
+
+def test_edges_of_a_box_stay_sharp_and_a_sphere_is_smooth() -> None:
+    box = ObjectModel.from_arrays(CORNERS, FACES)
+    assert len(box.vertices) == 24
+    np.testing.assert_allclose(np.abs(box.normals).max(axis=1), 1, atol=1e-6)
+    sphere = trimesh.creation.icosphere(3, 0.05)
+    model = ObjectModel.from_arrays(sphere.vertices, sphere.faces)
+    assert len(model.vertices) == len(sphere.vertices)
+    np.testing.assert_allclose(model.normals, model.vertices / 0.05, atol=0.02)
+
+
+def test_normals_do_not_depend_on_how_faces_are_cut() -> None:
+    """A corner of a cube has two or one triangles on a side; weighted by angles that makes no difference."""
+    _, _, unit = smooth_normals(
+        np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
+    )
+    np.testing.assert_allclose(unit, np.tile([0, 0, 1], (4, 1)), atol=1e-12)
+
+
+def test_useless_normals_are_repaired() -> None:
+    normals = np.tile([0.0, 0, 2], (4, 1))
+    normals[1], normals[2] = 0, np.nan
+    flat = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    model = ObjectModel.from_arrays(flat, [[0, 1, 2], [0, 2, 3]], normals=normals)
+    np.testing.assert_allclose(model.normals, np.tile([0, 0, 1], (4, 1)))
+
+
+def test_a_flat_object_has_a_diameter_and_an_outline() -> None:
+    model = ObjectModel.from_arrays([[0, 0, 0], [0.3, 0, 0], [0.3, 0.4, 0], [0, 0.4, 0]], [[0, 1, 2], [0, 2, 3]])
+    assert model.diameter == pytest.approx(0.5)
+    assert len(model.outline) == 4
+
+
+@settings(max_examples=20, derandomize=True, deadline=None)
+@given(st.integers(0, 1000))
+def test_diameter_is_the_largest_distance(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(60, 3)) * rng.uniform(0.01, 1, size=3) @ random_rotation(rng)
+    model = ObjectModel.from_arrays(points, rng.permuted(np.tile(np.arange(60), (40, 1)), axis=1)[:, :3])
+    v = model.vertices.astype(float)
+    assert model.diameter == pytest.approx(np.linalg.norm(v[:, None] - v[None], axis=-1).max(), rel=1e-6)
+
+
+def test_diameter_of_a_hull_with_very_many_corners() -> None:
+    directions = trimesh.creation.icosphere(5, 0.05)
+    assert ObjectModel.from_arrays(directions.vertices, directions.faces).diameter == pytest.approx(0.1, rel=1e-3)
+
+
+def test_points_are_spread_over_the_surface_and_repeatable() -> None:
+    model = ObjectModel.from_arrays(CORNERS, FACES)
+    points = model.sample_points(20_000, seed=3)
+    np.testing.assert_array_equal(points, model.sample_points(20_000, seed=3))
+    assert np.abs(points - model.sample_points(20_000, seed=4)).max() > 0
+    offset = np.abs(points - model.center) / (model.extents / 2)
+    np.testing.assert_allclose(offset.max(axis=1), 1, atol=1e-5)
+    share = [(offset[:, k] > 1 - 1e-5).mean() for k in range(3)]
+    areas = np.array([0.06 * 0.04, 0.10 * 0.04, 0.10 * 0.06])
+    np.testing.assert_allclose(share, areas / areas.sum(), atol=0.02)
+    np.testing.assert_allclose(points.mean(axis=0), model.center, atol=1e-3)
+
+
+# --- units ---
+
+
+def scaled(tmp_path: Path, diameter: float, units: str = "auto") -> ObjectModel:
+    size = np.linalg.norm([0.10, 0.06, 0.04])
+    return ObjectModel.load(write_ply(tmp_path / "duck.ply", np.asarray(BOX.vertices) * diameter / size, FACES), units)
+
+
+@pytest.mark.parametrize(("given", "units", "metres"), [(102, "mm", 0.102), (0.25, "m", 0.25), (2.9, "m", 2.9)])
+def test_auto_decides_by_the_diameter_and_says_so(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, given: float, units: str, metres: float
+) -> None:
+    caplog.set_level(logging.INFO, logger="posekit")
+    model = scaled(tmp_path, given)
+    assert model.units == units
+    assert model.diameter == pytest.approx(metres, rel=1e-5)
+    assert f"--units {units}" in caplog.text
+    assert "duck.ply" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("given", "units", "text"),
+    [
+        (7.0, "auto", "could be metres or millimetres: pass --units m or --units mm"),
+        (102.0, "m", r"duck.ply has a diameter of 102 m; posekit works in metres: pass --units mm"),
+        (0.5, "mm", r"has a diameter of 0.5 mm; posekit works in metres: pass --units m\."),
+        (50_000.0, "auto", "from 1 mm to 10 m: scale the mesh"),
+        (0.0004, "auto", "from 1 mm to 10 m: scale the mesh"),
+        (1.0, "inch", "units are auto, mm or m, not 'inch'"),
+    ],
+)
+def test_implausible_sizes_are_refused(tmp_path: Path, given: float, units: str, text: str) -> None:
+    with pytest.raises(MeshError, match=text):
+        scaled(tmp_path, given, units)
+
+
+def test_between_the_limits_units_given_by_hand_are_believed(tmp_path: Path) -> None:
+    assert scaled(tmp_path, 7.0, "m").diameter == pytest.approx(7.0, rel=1e-5)
+    assert scaled(tmp_path, 7.0, "mm").diameter == pytest.approx(0.007, rel=1e-5)
+
+
+# --- symmetries ---
+
+
+@pytest.mark.parametrize(
+    ("text", "discrete", "continuous"),
+    [("z:2", 1, 0), ("z:4", 3, 0), ("x:2,y:2", 3, 0), ("Z : inf", 0, 1), ("z:inf, x:2", 1, 1), ("z:4,x:2", 7, 0),
+     ("x:4,y:4", 23, 0), ("none", 0, 0)],
+)  # fmt: skip
+def test_symmetries_by_hand(text: str, discrete: int, continuous: int) -> None:
+    found = Symmetries.parse(text, [0.1, 0.2, 0.3])
+    assert (len(found.discrete), len(found.continuous)) == (discrete, continuous)
+    for transform in found.transforms(12):
+        np.testing.assert_allclose(transform.apply([0.1, 0.2, 0.3]), [0.1, 0.2, 0.3], atol=1e-9)
+
+
+@pytest.mark.parametrize("text", ["", "z", "z:1", "z:0", "w:2", "z:2;x:2", "z:2,", "z:-2", "z:half", "z:1000"])
+def test_symmetries_that_make_no_sense(text: str) -> None:
+    with pytest.raises(MeshError, match="is not AXIS:ORDER. Give x, y or z"):
+        Symmetries.parse(text, np.zeros(3))
+
+
+def test_turns_that_generate_no_finite_group() -> None:
+    with pytest.raises(MeshError, match="use inf"):
+        Symmetries.parse("x:3,y:3", np.zeros(3))
+
+
+def test_transforms_combine_as_bop_does() -> None:
+    found = Symmetries.parse("z:inf,x:2", np.zeros(3)).transforms(8)
+    assert len(found) == 16
+    np.testing.assert_allclose(found[0].matrix, np.eye(4))
+    angles = sorted({round(float(rotation_angle(a.R @ b.R.T)), 6) for a in found for b in found if a is not b})
+    assert angles[0] == pytest.approx(2 * np.pi / 8, abs=1e-5)
+
+
+def test_symmetries_beside_the_mesh(tmp_path: Path) -> None:
+    flip = np.diag([-1.0, -1, 1, 1])
+    flip[:3, 3] = (4, 2, 0)
+    info = {
+        "9": {"symmetries_discrete": [flip.ravel().tolist()]},
+        "can": {"symmetries_continuous": [{"axis": [0, 0, 2], "offset": [10, 0, 0]}]},
+    }
+    (tmp_path / "models_info.json").write_text(json.dumps(info))
+    for name in ("obj_000009.ply", "can.ply", "other.ply"):
+        write_ply(tmp_path / name, CORNERS * 1000, FACES)
+    by_number = ObjectModel.load(tmp_path / "obj_000009.ply").symmetries
+    np.testing.assert_allclose(by_number.discrete[0].t, [0.004, 0.002, 0])
+    by_stem = ObjectModel.load(tmp_path / "can.ply").symmetries
+    np.testing.assert_allclose(by_stem.continuous[0].axis, [0, 0, 1])
+    np.testing.assert_allclose(by_stem.continuous[0].offset, [0.01, 0, 0])
+    moved = by_stem.continuous[0].turn(1.0)
+    np.testing.assert_allclose(moved.apply([0.01, 0, 5]), [0.01, 0, 5], atol=1e-12)
+    assert len(ObjectModel.load(tmp_path / "other.ply").symmetries.transforms()) == 1
+
+    by_hand = ObjectModel.load(tmp_path / "can.ply", symmetry="z:2").symmetries
+    assert not by_hand.continuous
+    np.testing.assert_allclose(by_hand.discrete[0].apply([0.3, 0, -0.1]), [0.3, 0, -0.1], atol=1e-6)
+    assert not ObjectModel.load(tmp_path / "can.ply", symmetry="none").symmetries.continuous
+    given = Symmetries((Pose.rotation(np.diag([1.0, -1, -1])),))
+    assert ObjectModel.load(tmp_path / "can.ply", symmetry=given).symmetries is given
+
+    (tmp_path / "mine.json").write_text(json.dumps(info["9"]))
+    assert len(ObjectModel.load(tmp_path / "other.ply", symmetry=str(tmp_path / "mine.json")).symmetries.discrete) == 1
+    with pytest.raises(MeshError, match="there is no symmetry file"):
+        ObjectModel.load(tmp_path / "other.ply", symmetry=str(tmp_path / "not.json"))
+
+
+@pytest.mark.parametrize(
+    "info",
+    ["{", "[]", '{"box": {"symmetries_discrete": [[1, 2]]}}', '{"box": {"symmetries_continuous": [{"offset": [0, 0, 0]}]}}',
+     '{"box": {"symmetries_continuous": [{"axis": [0, 0, 0]}]}}', '{"box": {"symmetries_discrete": [' + str([0] * 16) + "]}}"],
+)  # fmt: skip
+def test_damaged_symmetry_files(tmp_path: Path, info: str) -> None:
+    (tmp_path / "models_info.json").write_text(info)
+    write_ply(tmp_path / "box.ply", CORNERS, FACES)
+    with pytest.raises(MeshError, match=r"the symmetries in .*models_info.json cannot be used"):
+        ObjectModel.load(tmp_path / "box.ply")
+
+
+# --- what is refused ---
+
+
+def test_missing_files_and_unknown_formats(tmp_path: Path) -> None:
+    with pytest.raises(MeshError, match=r"there is no mesh .*nothing.ply: check the path"):
+        ObjectModel.load(tmp_path / "nothing.ply")
+    (tmp_path / "box.step").write_text("x")
+    with pytest.raises(MeshError, match=r"has the extension .step: posekit reads .ply, .obj, .glb"):
+        ObjectModel.load(tmp_path / "box.step")
+    (tmp_path / "folder.ply").mkdir()
+    with pytest.raises(MeshError, match="cannot be read"):
+        ObjectModel.load(tmp_path / "folder.ply")
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.obj", "a.glb", "a.stl", "a.gltf"])
+def test_empty_and_damaged_files(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    path.write_bytes(b"")
+    with pytest.raises(MeshError, match=r"is an empty file: export the mesh again"):
+        ObjectModel.load(path)
+    path.write_bytes(b"hello, this is no mesh at all\n" * 3)
+    with pytest.raises(MeshError, match=r"again"):
+        ObjectModel.load(path)
+
+
+def test_truncated_binary_ply(tmp_path: Path) -> None:
+    path = tmp_path / "box.ply"
+    trimesh.Trimesh(CORNERS, FACES, process=False).export(path)
+    path.write_bytes(path.read_bytes()[:-60])
+    with pytest.raises(MeshError, match=r"box.ply cannot be read as PLY"):
+        ObjectModel.load(path)
+
+
+def test_meshes_without_a_surface(tmp_path: Path) -> None:
+    with pytest.raises(MeshError, match=r"8 (vertices|points) and no faces"):
+        ObjectModel.load(write_ply(tmp_path / "points.ply", CORNERS, []))
+    with pytest.raises(MeshError, match="is an empty mesh: it has no vertices"):
+        ObjectModel.load(write_ply(tmp_path / "none.ply", np.zeros((0, 3)), []))
+    with pytest.raises(MeshError, match=r"has 1 face with an area: an object needs at least two"):
+        ObjectModel.load(write_ply(tmp_path / "one.ply", CORNERS, FACES[:1]))
+    with pytest.raises(MeshError, match=r"has no faces with an area"):
+        ObjectModel.load(write_ply(tmp_path / "line.ply", np.outer(np.arange(8), [1, 1, 1]), FACES))
+    (tmp_path / "points.obj").write_text("v 0 0 0\nv 1 0 0\n")
+    with pytest.raises(MeshError, match=r"2 points and no faces"):
+        ObjectModel.load(tmp_path / "points.obj")
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_vertices_that_are_no_numbers(tmp_path: Path, bad: float) -> None:
+    vertices = CORNERS.copy()
+    vertices[3, 1] = bad
+    with pytest.raises(MeshError, match=r"has 1 vertices that are NaN or infinite \(the first is number 3\)"):
+        ObjectModel.load(write_ply(tmp_path / "box.ply", vertices, FACES))
+
+
+def test_faces_that_name_no_vertex(tmp_path: Path) -> None:
+    faces = FACES.copy()
+    faces[2, 0] = 8
+    with pytest.raises(MeshError, match="a face that names vertex 8, but its vertices are 0 to 7"):
+        ObjectModel.load(write_ply(tmp_path / "box.ply", CORNERS, faces))
+    (tmp_path / "box.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 2 9\n")
+    with pytest.raises(MeshError, match=r"box.obj cannot be read as OBJ.*Export it again"):
+        ObjectModel.load(tmp_path / "box.obj")
+    (tmp_path / "relative.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\n")
+    with pytest.raises(MeshError, match="negative face indices"):
+        ObjectModel.load(tmp_path / "relative.obj")
+
+
+def test_missing_and_damaged_textures(tmp_path: Path) -> None:
+    path = write_obj(tmp_path / "thing.obj")
+    with pytest.raises(MeshError, match=r"thing.obj names the file 'skin.png', which is not there: put it at"):
+        ObjectModel.load(path)
+    picture(tmp_path / "skin.png")
+    (tmp_path / "skin.png").write_bytes((tmp_path / "skin.png").read_bytes()[:70])
+    with pytest.raises(MeshError, match="which is not a readable picture"):
+        ObjectModel.load(path)
+    path.with_suffix(".mtl").unlink()
+    with pytest.raises(MeshError, match=r"names the file 'thing.mtl', which is not there"):
+        ObjectModel.load(path)
+    ply = write_ply(tmp_path / "box.ply", CORNERS, FACES, head="comment TextureFile gone.png\n")
+    with pytest.raises(MeshError, match=r"names the file 'gone.png'"):
+        ObjectModel.load(ply)
+
+
+def test_arrays_that_do_not_fit() -> None:
+    with pytest.raises(MeshError, match=r"vertices are \(V, 3\) and faces \(F, 3\), not \(8, 2\)"):
+        ObjectModel.from_arrays(CORNERS[:, :2], FACES)
+    with pytest.raises(MeshError, match=r"colors must be finite numbers in 8 rows"):
+        ObjectModel.from_arrays(CORNERS, FACES, colors=COLOURS[:5])
