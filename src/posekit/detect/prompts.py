@@ -20,7 +20,7 @@ Mask = NDArray[np.bool_]
 
 MASK_SOURCES = ("grabcut", "filled")
 
-# Chosen on real crops: docs/decisions/0102-grabcut.md
+# Chosen on real crops: docs/decisions/0004-mask-from-a-box.md
 _SIDE = 176  # longer side of the picture that GrabCut works on, pixels
 _MARGIN = 0.12  # ground round the box that it sees, of the box's longer side
 _SURE, _LIKELY = 0.45, 1.15  # ellipses, of the box's own: inside the first is object, outside the second likely ground

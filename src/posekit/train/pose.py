@@ -30,6 +30,9 @@ from posekit.nets.losses import DenseLossConfig, Target, dense_loss
 from posekit.nets.weights import build, save_networks
 
 
+HELD_BACK = 12  # batches of the validation
+
+
 @dataclass(frozen=True)
 class PoseTrainConfig:
     """steps: optimiser steps of the whole schedule. ema: decay per step. validate, save: every so many steps."""
@@ -137,9 +140,12 @@ class Trainer:
         self.net.load_state_dict(_part(state, "net."))
         self.average.load_state_dict(_part(state, "average."))
         whole = self.optimiser.state_dict()
+        parameters = [p for group in self.optimiser.param_groups for p in group["params"]]
         moments: dict[int, dict[str, Tensor]] = {}
         for key, value in _part(state, "optimiser.").items():
             index, name = key.split(".", 1)
+            if name != "step":  # the fused optimiser needs the moments in their parameter's memory layout
+                value = torch.empty_like(parameters[int(index)]).copy_(value)
             moments.setdefault(int(index), {})[name] = value
         whole["state"] = moments
         self.optimiser.load_state_dict(whole)
@@ -153,7 +159,7 @@ class Trainer:
             output = self.net.predict(images_to_tensor(batch["observed"]), images_to_tensor(batch["rendered"]))
         loss, parts = dense_loss(output, self.net.heads, to_target(batch), self.config.loss)
         if not torch.isfinite(loss):
-            raise FloatingPointError(f"the loss became {float(loss)} at step {self.step}; {self.checkpoint} is intact")
+            raise FloatingPointError(f"the loss became {float(loss.detach())} at step {self.step}; {self.checkpoint} is intact")
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         nn.utils.clip_grad_norm_(self.net.parameters(), self.config.clip)
@@ -181,8 +187,8 @@ def train(config: PoseTrainConfig, run: Path, photos: Path | None) -> None:
     seed = config.seed + trainer.step
     stream = batches(config, seed, photos, config.workers)
     small = dataclasses.replace(config.stream, pool=256, reuse=1)
-    held_back_stream = batches(dataclasses.replace(config, stream=small), 10**6, photos, 1)
-    held_back = [next(held_back_stream) for _ in range(12)]
+    held_back_stream = batches(dataclasses.replace(config, stream=small), 10**6, photos, config.workers)
+    held_back = [next(held_back_stream) for _ in range(HELD_BACK)]
     del held_back_stream
     if not resumed:
         measure_statistics(trainer.net.heads, stream)
