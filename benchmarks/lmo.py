@@ -103,14 +103,14 @@ def main() -> None:
     args = parser.parse_args()
 
     data = BopDataset(args.root)
-    every = [i for s, im in data.images() for i in data.instances(s, im) if i.visib_fract > args.min_visible]
+    chosen = [i for s, im in data.images() for i in data.instances(s, im, every=True) if i.visib_fract > args.min_visible]
     if args.limit:
-        every = [every[k] for k in np.linspace(0, len(every) - 1, args.limit).round().astype(int)]
+        chosen = [chosen[k] for k in np.linspace(0, len(chosen) - 1, args.limit).round().astype(int)]
     options = EstimateOptions(hypotheses=args.hypotheses, update=args.update, stop=args.stop, iterations=args.iterations)
     estimators: dict[int, PoseEstimator] = {}
     rng = np.random.default_rng(args.seed)
     rows: list[Row] = []
-    for instance in every:
+    for instance in chosen:
         if instance.obj_id not in estimators:
             estimators[instance.obj_id] = PoseEstimator(
                 data.model(instance.obj_id), preset=args.preset, weights=args.weights, options=options, threads=args.threads

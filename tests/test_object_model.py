@@ -390,7 +390,7 @@ def test_symmetries_by_hand(text: str, discrete: int, continuous: int) -> None:
 
 @pytest.mark.parametrize("text", ["", "z", "z:1", "z:0", "w:2", "z:2;x:2", "z:2,", "z:-2", "z:half", "z:1000"])
 def test_symmetries_that_make_no_sense(text: str) -> None:
-    with pytest.raises(MeshError, match="is not AXIS:ORDER. Give x, y or z"):
+    with pytest.raises(MeshError, match=r"is not AXIS:ORDER\. Give x, y or z"):
         Symmetries.parse(text, np.zeros(3))
 
 
@@ -441,9 +441,15 @@ def test_symmetries_beside_the_mesh(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "info",
-    ["{", "[]", '{"box": {"symmetries_discrete": [[1, 2]]}}', '{"box": {"symmetries_continuous": [{"offset": [0, 0, 0]}]}}',
-     '{"box": {"symmetries_continuous": [{"axis": [0, 0, 0]}]}}', '{"box": {"symmetries_discrete": [' + str([0] * 16) + "]}}"],
-)  # fmt: skip
+    [
+        "{",
+        "[]",
+        '{"box": {"symmetries_discrete": [[1, 2]]}}',
+        '{"box": {"symmetries_discrete": [[0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1]]}}',
+        '{"box": {"symmetries_continuous": [{"offset": [0, 0, 0]}]}}',
+        '{"box": {"symmetries_continuous": [{"axis": [0, 0, 0]}]}}',
+    ],
+)
 def test_damaged_symmetry_files(tmp_path: Path, info: str) -> None:
     (tmp_path / "models_info.json").write_text(info)
     write_ply(tmp_path / "box.ply", CORNERS, FACES)

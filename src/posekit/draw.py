@@ -24,6 +24,7 @@ PAPER: Colour = (24, 26, 30)  # behind tiles
 GREEN: Colour = (64, 255, 96)  # what was found
 ORANGE: Colour = (255, 170, 30)  # what was given
 AXES: tuple[Colour, Colour, Colour] = ((255, 70, 70), (80, 230, 80), (80, 140, 255))  # x, y, z
+GAP = 4  # pixels between tiles
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
@@ -75,7 +76,7 @@ def caption(image: Image, text: str, colour: Colour = WHITE) -> Image:
     return cv2.putText(out, text, (3, text_height + 2), FONT, size, colour, 1, cv2.LINE_AA)
 
 
-def grid(images: Sequence[Image], columns: int | None = None, captions: Sequence[str] = (), gap: int = 4) -> Image:
+def grid(images: Sequence[Image], columns: int | None = None, captions: Sequence[str] = (), gap: int = GAP) -> Image:
     """A contact sheet of pictures of one size, row by row; about square where ``columns`` is not given.
 
     captions: one for each picture, or none. Raises ValueError where there is no picture or sizes differ.
@@ -93,19 +94,24 @@ def grid(images: Sequence[Image], columns: int | None = None, captions: Sequence
     return sheet
 
 
-def strip(images: Sequence[Image], captions: Sequence[str], width: int, gap: int = 4) -> Image:
-    """Pictures of one size in one row exactly ``width`` pixels wide, each with its caption."""
+def strip_tile(count: int, width: int, gap: int = GAP) -> tuple[int, int]:
+    """(width, height) of the 4:3 pictures of which ``count`` fill a strip."""
+    tile = max(4, (width - (count - 1) * gap) // count)
+    return tile, round(0.75 * tile)
+
+
+def strip(images: Sequence[Image], captions: Sequence[str], width: int, gap: int = GAP) -> Image:
+    """Pictures in one row of ``width`` pixels, each with its caption; see ``strip_tile`` for their size."""
     count = len(images)
-    tile = max(1, (width - (count - 1) * gap) // count)
-    height = max(1, round(tile * images[0].shape[0] / images[0].shape[1]))
-    row = grid([fit(image, (tile, height)) for image in images], count, captions, gap)
-    sheet = _paper(height, width)
-    left = (width - row.shape[1]) // 2
+    size = strip_tile(count, width, gap)
+    row = grid([fit(image, size) for image in images], count, captions, gap)
+    sheet = _paper(size[1], max(width, row.shape[1]))
+    left = (sheet.shape[1] - row.shape[1]) // 2
     sheet[:, left : left + row.shape[1]] = row
     return sheet
 
 
-def stack(images: Sequence[Image], gap: int = 4) -> Image:
+def stack(images: Sequence[Image], gap: int = GAP) -> Image:
     """Pictures below each other, each at the left, over a common ground."""
     width = max(image.shape[1] for image in images)
     sheet = _paper(sum(image.shape[0] + gap for image in images) - gap, width)
@@ -118,6 +124,8 @@ def stack(images: Sequence[Image], gap: int = 4) -> Image:
 
 def fit(image: Image, size: tuple[int, int]) -> Image:
     """A picture resized to (width, height), averaged where it shrinks."""
+    if size == (image.shape[1], image.shape[0]):
+        return image
     shrinks = size[0] < image.shape[1]
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
 

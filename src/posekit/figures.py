@@ -16,8 +16,7 @@ from posekit.view import View
 from posekit.zoom import zoom_to_box
 
 _SIDES = (640, 1600)  # pixels, limits of the overlay's longer side, whatever the photograph's is
-_TILE = (320, 240)
-_ITERATIONS = 3  # tiles of the strip between the first and the final pose
+_ITERATIONS = 2  # tiles of the strip between the first and the final pose
 _CONTEXT = 1.3  # a tile shows this many boxes
 
 
@@ -40,9 +39,10 @@ def overlay(renderer: Renderer, model: ObjectModel, view: View, estimates: Seque
 
 def strip(renderer: Renderer, model: ObjectModel, view: View, estimate: Estimate, width: int) -> Image:
     """Crop, first pose, iterations and final pose in one row of ``width`` pixels, with the predicted errors."""
-    zoom = zoom_to_box(view.camera, estimate.box, _TILE, enlarge=_CONTEXT)
-    crop = view.with_mask(None).zoomed(zoom)
     titles, poses = _chosen_steps(estimate)
+    size = draw.strip_tile(1 + len(poses), width)
+    zoom = zoom_to_box(view.camera, estimate.box, size, enlarge=_CONTEXT)
+    crop = view.with_mask(None).zoomed(zoom)
     turned = [Pose.rotation(zoom.R_view_cam) @ pose for pose in poses]
     tiles = [crop.image]
     for drawn in renderer.render(model, turned, zoom.camera, rgb=False, coords=False):

@@ -26,7 +26,7 @@ def write_bytes_atomic(path: Path, data: bytes) -> None:
         if isinstance(error, OSError):
             reason = error.strerror or str(error)
             raise OutputError(
-                f"{path} cannot be written: {reason}. Choose a place that exists and is writable."
+                f"{path} cannot be written: {reason}. Name a folder that exists and is writable."
             ) from error
         raise
 

@@ -234,7 +234,7 @@ def load_camera(source: str | Path, size: Size, image: str | Path | None = None)
         camera = _camera_from_text(content, path, size, image)
     except CameraError as error:
         raise CameraError(f"{path.name}: {error}") from error
-    except (ValueError, TypeError, KeyError, AttributeError, cv2.error) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, cv2.error, SystemError) as error:  # the last is OpenCV's
         raise CameraError(
             f"{path.name} holds no camera that posekit understands ({error}): give {_CAMERA_FORMS}."
         ) from error

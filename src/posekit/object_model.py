@@ -317,7 +317,8 @@ def smooth_normals(vertices: Floats, faces: NDArray[np.int64]) -> tuple[NDArray[
         total[alike + step] += weighted[alike]
         step += 1
     unit = np.empty_like(total)
-    unit[order] = total / np.linalg.norm(total, axis=1, keepdims=True)
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    unit[order] = np.where(length > 1e-9, total, normal) / np.where(length > 1e-9, length, 1.0)
     keys = np.column_stack([faces.ravel(), np.rint(unit * 1e4).astype(np.int64)])
     _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     return faces.ravel()[first], inverse.reshape(-1, 3), unit[first]
@@ -551,6 +552,8 @@ def _with_material(part: _Part, mesh: Any, label: str) -> _Part:
     """The part with its texture, or its colours, or its material's one colour."""
     material, count = mesh.visual.material, len(part.vertices)
     image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
+    if image is not None and image.format is None and image.size == (2, 2):
+        image = None  # trimesh's placeholder where nothing names a texture
     uvs = mesh.visual.uv
     factor = getattr(material, "baseColorFactor", None)  # glTF
     if factor is None and "kd" in getattr(material, "kwargs", {}):  # MTL
@@ -760,6 +763,8 @@ def _symmetries_from_file(file: Path, mesh: Path) -> Symmetries:
     """The entry for a mesh in a file of models_info.json's form, or of an entry's own form (mm)."""
     try:
         data = json.loads(file.read_text(encoding="utf-8"))
+        if not isinstance(data, dict):
+            raise ValueError("its outermost part is not {...}")
         number = re.fullmatch(r"obj_(\d+)", mesh.stem)
         keys = [mesh.stem, *([str(int(number[1]))] if number else [])]
         own = data if any(key.startswith("symmetries_") for key in data) else {}

@@ -101,7 +101,7 @@ def _weights() -> list[Finding]:
             path, networks = find_weights(preset), load_networks(preset)
         except WeightsError as error:
             essential = preset == PRESETS[0]
-            todo = _reinstall("posekit") if essential else f"Train it, or use --preset {PRESETS[0]}."
+            todo = _reinstall("posekit") if essential else ""
             found.append(Finding(topic, str(error), "problem" if essential else "note", todo))
             continue
         about = "; ".join(f"{key}: {value}" for key, value in networks.about.items())

@@ -1,6 +1,7 @@
-"""Train SV-Net lite on rendered pairs: ``python -m posekit.train.pose --run runs/svnet``. Layer 5.
+"""Train SV-Net lite on rendered pairs: ``python -m posekit.train.pose --out runs/svnet``. Layer 5.
 
-One process trains while a worker renders. A checkpoint every few minutes; the same command resumes from it.
+A process trains while its worker renders; under torchrun several do, each with its own batches, gradients averaged
+over all. A checkpoint every few minutes; the same command resumes from it.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+import torch.distributed as dist
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
@@ -94,6 +96,18 @@ def validate(net: LiteSVNet, held_back: list[dict[str, Tensor]], config: DenseLo
     return sums
 
 
+def average_gradients(parameters: list[nn.Parameter]) -> None:
+    """Average the gradients over all processes, in one message; nothing where there is only one."""
+    if not dist.is_initialized():
+        return
+    gradients = [p.grad for p in parameters if p.grad is not None]
+    flat = torch.cat([g.flatten() for g in gradients])
+    dist.all_reduce(flat)
+    flat /= dist.get_world_size()
+    for gradient, part in zip(gradients, flat.split([g.numel() for g in gradients]), strict=True):
+        gradient.copy_(part.view(gradient.shape))
+
+
 class Trainer:
     """The network, its moving average, the optimiser, and their checkpoint."""
 
@@ -162,6 +176,7 @@ class Trainer:
             raise FloatingPointError(f"the loss became {float(loss.detach())} at step {self.step}; {self.checkpoint} is intact")
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
+        average_gradients(list(self.net.parameters()))
         nn.utils.clip_grad_norm_(self.net.parameters(), self.config.clip)
         self.optimiser.step()
         self.average.update_parameters(self.net)
@@ -184,20 +199,26 @@ def train(config: PoseTrainConfig, run: Path, photos: Path | None) -> None:
     torch.set_num_threads(config.threads)
     trainer = Trainer(config, run)
     resumed = trainer.load()
-    seed = config.seed + trainer.step
+    rank = dist.get_rank() if dist.is_initialized() else 0
+    seed = config.seed + trainer.step + 1_000_003 * rank
     stream = batches(config, seed, photos, config.workers)
     small = dataclasses.replace(config.stream, pool=256, reuse=1)
     held_back_stream = batches(dataclasses.replace(config, stream=small), 10**6, photos, config.workers)
-    held_back = [next(held_back_stream) for _ in range(HELD_BACK)]
+    held_back = [next(held_back_stream) for _ in range(HELD_BACK)] if rank == 0 else []
     del held_back_stream
     if not resumed:
         measure_statistics(trainer.net.heads, stream)
+    if dist.is_initialized():
+        for value in trainer.net.state_dict().values():
+            dist.broadcast(value, 0)
     log = run / "log.csv"
     running: dict[str, float] = {}
     started = time.monotonic() - trainer.seconds
     while trainer.step < config.steps:
         parts = trainer.train_step(next(stream))
         trainer.seconds = time.monotonic() - started
+        if rank:
+            continue
         running = {k: v if k not in running else 0.98 * running[k] + 0.02 * v for k, v in parts.items()}
         if trainer.step % 50 == 0:
             _log(log, {"step": trainer.step, "seconds": trainer.seconds, "set": "train", **running})
@@ -223,7 +244,7 @@ def _log(path: Path, row: dict[str, object]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--run", type=Path, required=True, help="folder of checkpoints and logs; resumed where it exists")
+    parser.add_argument("--out", type=Path, required=True, help="folder of checkpoints and logs; resumed where it exists")
     parser.add_argument("--backgrounds", type=Path, help="folder of photographs for backgrounds and textures")
     parser.add_argument("--steps", type=int, default=PoseTrainConfig.steps)
     parser.add_argument("--batch", type=int, default=StreamConfig.batch)
@@ -231,8 +252,10 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     args = parser.parse_args()
     stream = StreamConfig(batch=args.batch)
+    if "WORLD_SIZE" in os.environ:
+        dist.init_process_group("gloo")
     config = PoseTrainConfig(steps=args.steps, rate=args.rate, threads=args.threads, stream=stream)
-    train(config, args.run, args.backgrounds)
+    train(config, args.out, args.backgrounds)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,185 @@
+"""Data sets in BOP layout, read from a small one made here."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from posekit.data.bop import BopDataset
+from posekit.errors import CameraError, ImageError, InputError, MeshError, PromptError
+from posekit.geometry import random_rotation
+
+R = random_rotation(np.random.default_rng(1))
+
+
+def put(path: Path, data: object) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(data))
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """Two scenes; image 3 of the first has two instances of object 5 and one of object 9."""
+    models = tmp_path / "models"
+    models.mkdir()
+    for k in (5, 9):
+        trimesh.creation.box((100 + k, 60, 40)).export(models / f"obj_{k:06d}.ply")
+    put(models / "models_info.json", {"9": {"symmetries_discrete": [np.diag([-1.0, -1, 1, 1]).ravel().tolist()]}})
+    for scene, images in ((2, (3, 11)), (40, (0,))):
+        folder = tmp_path / "test" / f"{scene:06d}"
+        (folder / "rgb").mkdir(parents=True)
+        (folder / "mask_visib").mkdir()
+        truth = [
+            {"obj_id": k, "cam_R_m2c": R.ravel().tolist(), "cam_t_m2c": [10.0 * i, -20.0, 800.0]}
+            for i, k in enumerate((5, 9, 5))
+        ]
+        info = [
+            {
+                "bbox_obj": [10 * i, 20, 30, 40],
+                "bbox_visib": [10 * i, 20, 15, 40] if i else [-1] * 4,
+                "visib_fract": 0.4 * i,
+            }
+            for i in range(3)
+        ]
+        put(folder / "scene_gt.json", {str(i): truth for i in images})
+        put(folder / "scene_gt_info.json", {str(i): info for i in images})
+        cameras = {str(i): {"cam_K": [500 + i, 0, 31.5, 0, 501, 23.5, 0, 0, 1], "depth_scale": 1.0} for i in images}
+        put(folder / "scene_camera.json", cameras)
+        for i in images:
+            Image.new("RGB", (64, 48), (i, 0, 0)).save(folder / "rgb" / f"{i:06d}.png")
+        mask = np.zeros((48, 64), np.uint8)
+        Image.fromarray(mask).save(folder / "mask_visib" / "000003_000000.png")
+        mask[5:9, 6:8] = 255
+        Image.fromarray(mask).save(folder / "mask_visib" / "000003_000001.png")
+    return tmp_path
+
+
+def test_what_there_is(root: Path) -> None:
+    data = BopDataset(root)
+    assert data.model_ids() == [5, 9]
+    assert data.scenes() == [2, 40]
+    assert data.images() == [(2, 3), (2, 11), (40, 0)]
+    assert data.images(2) == [(2, 3), (2, 11)]
+    assert data.targets is None
+
+
+def test_models_are_in_metres_and_loaded_once(root: Path) -> None:
+    data = BopDataset(root)
+    np.testing.assert_allclose(data.model(9).extents, [0.109, 0.06, 0.04], atol=1e-6)
+    assert len(data.model(9).symmetries.discrete) == 1
+    assert data.model(9) is data.model(9)
+
+
+def test_views_have_their_own_camera(root: Path) -> None:
+    data = BopDataset(root)
+    view = data.view(2, 11)
+    assert (view.camera.fx, view.camera.fy, view.camera.size) == (511, 501, (64, 48))
+    assert view.image[0, 0].tolist() == [11, 0, 0]
+    assert data.view(2, 3).camera.fx == 503
+
+
+def test_instances(root: Path) -> None:
+    first, second, _ = BopDataset(root).instances(2, 3)
+    assert (second.scene, second.image, second.index, second.obj_id) == (2, 3, 1, 9)
+    np.testing.assert_allclose(second.T_cam_obj.t, [0.01, -0.02, 0.8])
+    np.testing.assert_allclose(second.T_cam_obj.R, R, atol=1e-9)
+    assert second.box_obj == (10, 20, 40, 60)
+    assert second.box_visib == (10, 20, 25, 60)
+    assert second.visib_fract == pytest.approx(0.4)
+    assert second.mask().sum() == 8
+    assert first.box_visib is None
+    assert not first.mask().any()  # hidden altogether
+
+
+def test_a_truth_that_is_scaled_a_little_is_a_rotation_again(root: Path) -> None:
+    path = root / "test" / "000002" / "scene_gt.json"
+    truth = json.loads(path.read_text())
+    truth["3"][0]["cam_R_m2c"] = (R * 1.0023).ravel().tolist()
+    put(path, truth)
+    np.testing.assert_allclose(BopDataset(root).instances(2, 3)[0].T_cam_obj.R, R, atol=1e-9)
+
+
+def test_targets_choose_images_and_instances(root: Path) -> None:
+    put(root / "test_targets_bop24.json", [{"scene_id": 40, "im_id": 0, "obj_id": 5, "inst_count": 1}])
+    put(root / "test_targets_bop19.json", [{"scene_id": 2, "im_id": 3, "obj_id": 5, "inst_count": 1}])
+    data = BopDataset(root)
+    assert data.images() == [(2, 3)]
+    assert [i.index for i in data.instances(2, 3)] == [2]  # the more visible one of the two
+    assert len(data.instances(2, 3, every=True)) == 3
+    assert data.images(40) == []
+    assert BopDataset(root, targets="test_targets_bop24.json").images() == [(40, 0)]
+    assert len(BopDataset(root, targets=None).images()) == 3
+    with pytest.raises(InputError, match=r"there is no targets file .*x.json: check its name, or pass targets=None"):
+        BopDataset(root, targets="x.json")
+    put(root / "test_targets_bop19.json", [{"scene": 2}])
+    with pytest.raises(InputError, match="is no list of targets with scene_id"):
+        BopDataset(root).images()
+
+
+def test_without_scene_gt_info_boxes_are_unknown(root: Path) -> None:
+    (root / "test" / "000002" / "scene_gt_info.json").unlink()
+    [first, *_] = BopDataset(root).instances(2, 3)
+    assert first.box_obj is None
+    assert np.isnan(first.visib_fract)
+
+
+def test_what_is_missing_is_named(root: Path) -> None:
+    with pytest.raises(InputError, match=r"has no folder 'val': a data set in BOP layout has models/"):
+        BopDataset(root, split="val")
+    with pytest.raises(InputError, match=r"there is no scene .*000003; there are \[2, 40\]"):
+        BopDataset(root).images(3)
+    with pytest.raises(MeshError, match=r"there is no mesh .*obj_000007.ply for object 7; there are \[5, 9\]"):
+        BopDataset(root).model(7)
+    with pytest.raises(MeshError, match="there are no meshes"):
+        BopDataset(root, models="models_eval").model_ids()
+    data = BopDataset(root)
+    with pytest.raises(InputError, match="has no annotations for image 12"):
+        data.instances(2, 12)
+    with pytest.raises(InputError, match=r"there is no photograph .*000012.png"):
+        data.view(2, 12)
+    with pytest.raises(CameraError, match="has no camera for image 12"):
+        data.camera(2, 12, (64, 48))
+    with pytest.raises(PromptError, match="is not there"):
+        data.instances(2, 3)[2].mask()
+
+
+@pytest.mark.parametrize("name", ["scene_gt.json", "scene_camera.json"])
+def test_missing_and_damaged_scene_files(root: Path, name: str) -> None:
+    path = root / "test" / "000002" / name
+
+    def use() -> None:
+        data = BopDataset(root)
+        data.view(2, 3)
+        data.instances(2, 3)
+
+    path.write_text("{")
+    with pytest.raises(InputError, match=f"{name} cannot be read"):
+        use()
+    path.write_text("[]")
+    with pytest.raises(InputError, match="does not map image numbers to entries"):
+        use()
+    path.unlink()
+    with pytest.raises(InputError, match=f"there is no file .*{name}: this copy of the data set is not complete"):
+        use()
+
+
+def test_annotations_that_do_not_fit(root: Path) -> None:
+    folder = root / "test" / "000002"
+    put(folder / "scene_gt_info.json", {"3": []})
+    with pytest.raises(InputError, match=r"has 0 entries for image 3, scene_gt.json 3: they belong together"):
+        BopDataset(root).instances(2, 3)
+    put(folder / "scene_gt.json", {"3": [{"obj_id": 5, "cam_R_m2c": [0] * 9, "cam_t_m2c": [0, 0, 1]}]})
+    put(folder / "scene_gt_info.json", {"3": [{"bbox_obj": [0] * 4, "bbox_visib": [0] * 4, "visib_fract": 1}]})
+    with pytest.raises(InputError, match=r"annotation 0 of image 3 .* is not BOP's"):
+        BopDataset(root).instances(2, 3)
+
+
+def test_a_damaged_photograph(root: Path) -> None:
+    (root / "test" / "000002" / "rgb" / "000003.png").write_bytes(b"\x89PNG")
+    with pytest.raises(ImageError):
+        BopDataset(root).view(2, 3)

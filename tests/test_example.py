@@ -1,0 +1,107 @@
+"""The demo's example and the figures made of an estimate."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from posekit import figures
+from posekit.camera import Camera, mask_box
+from posekit.data.example import Example, locomotive, make_example, ply
+from posekit.geometry import Pose
+from posekit.object_model import ObjectModel
+from posekit.render import Renderer
+from posekit.results import Detection, Estimate, Step
+from posekit.view import View
+
+
+@pytest.fixture(scope="module")
+def renderer() -> Renderer:
+    return Renderer()
+
+
+@pytest.fixture(scope="module")
+def example(renderer: Renderer) -> Example:
+    return make_example(renderer)
+
+
+def test_the_locomotive_is_a_toy_of_sensible_size() -> None:
+    model = locomotive()
+    assert 0.15 < model.diameter < 0.25
+    assert model.vertices[:, 2].min() == pytest.approx(0, abs=1e-6)
+    assert model.colors is not None
+    assert len(np.unique(model.colors, axis=0)) >= 8
+
+
+def test_the_locomotive_looks_outwards() -> None:
+    corners = locomotive().vertices.astype(np.float64)[locomotive().faces]
+    volume = np.einsum("ij,ij->", np.cross(corners[:, 0], corners[:, 1]), corners[:, 2]) / 6
+    assert volume > 1e-4
+
+
+def test_the_picture_shows_the_object_at_its_pose(example: Example, renderer: Renderer) -> None:
+    assert example.view.camera.size == (640, 480)
+    [drawn] = renderer.render(example.model, [example.T_cam_obj], example.view.camera)
+    assert drawn.mask is not None
+    assert mask_box(drawn.mask) == example.box
+    inside = drawn.mask
+    difference = np.abs(example.view.image.astype(float) - drawn.image)[inside].mean()
+    shifted = np.abs(np.roll(example.view.image, 12, axis=1).astype(float) - drawn.image)[inside].mean()
+    assert difference < 0.5 * shifted
+
+
+def test_the_example_is_the_same_every_time(example: Example, renderer: Renderer) -> None:
+    again = make_example(renderer)
+    np.testing.assert_array_equal(again.view.image, example.view.image)
+    other = make_example(renderer, seed=1)
+    assert not np.allclose(other.T_cam_obj.R, example.T_cam_obj.R)
+
+
+def test_the_mesh_comes_back_from_its_file(tmp_path: Path) -> None:
+    model = locomotive()
+    (tmp_path / "toy.ply").write_text(ply(model))
+    read = ObjectModel.load(tmp_path / "toy.ply", units="m")
+    np.testing.assert_allclose(read.extents, model.extents, atol=1e-6)
+    assert len(read.faces) == len(model.faces)
+    assert read.colors is not None
+
+
+def estimate(example: Example, steps: int) -> Estimate:
+    trace = tuple(
+        Step(Pose(example.T_cam_obj.R, example.T_cam_obj.t + [0.002 * k, 0, 0]), 0.01 * k) for k in range(steps, 0, -1)
+    )
+    detection = Detection(box=example.box, source="box+filled")
+    return Estimate(example.T_cam_obj, 0.01, steps, True, 0.9, example.box, "locomotive", detection, trace)
+
+
+@pytest.mark.parametrize("steps", [0, 1, 3, 50])
+def test_overlay_shows_the_photograph_and_a_strip(example: Example, renderer: Renderer, steps: int) -> None:
+    picture = figures.overlay(renderer, example.model, example.view, [estimate(example, steps)])
+    assert picture.dtype == np.uint8
+    assert picture.shape[1] == 640
+    assert picture.shape[0] > 480 + 60
+    changed = (picture[:480] != example.view.image).any(axis=2)
+    assert 0.005 < changed.mean() < 0.1
+    x0, y0, x1, y1 = (int(v) for v in example.box)
+    changed[y0 - 80 : y1 + 80, x0 - 80 : x1 + 80] = False
+    assert not changed.any()
+
+
+def test_overlay_of_nothing_is_the_photograph(example: Example, renderer: Renderer) -> None:
+    np.testing.assert_array_equal(figures.overlay(renderer, example.model, example.view, []), example.view.image)
+
+
+@pytest.mark.parametrize(
+    ("size", "shown"), [((64, 48), (640, 480)), ((3200, 2400), (1600, 1200)), ((40, 800), (40, 800))]
+)
+def test_overlays_suit_a_screen(
+    size: tuple[int, int], shown: tuple[int, int], example: Example, renderer: Renderer
+) -> None:
+    camera = Camera.from_fov(0.9, *size)
+    view = View(np.full((size[1], size[0], 3), 90, np.uint8), camera)
+    found = Estimate(Pose.translation([0, 0, 0.8]), 0.01, 1, True, 0.9, (0, 0, *size), "locomotive")
+    picture = figures.overlay(renderer, example.model, view, [found])
+    assert picture.shape[0] > shown[1]
+    assert picture.shape[1] == max(640, shown[0])
