@@ -30,7 +30,7 @@ def main() -> None:
     refused, seconds = 0, 0.0
     for scene, image in data.images():
         view = data.view(scene, image)
-        for instance in data.instances(scene, image):
+        for instance in data.instances(scene, image, every=True):
             if instance.box_obj is None or instance.visib_fract <= args.min_visible:
                 continue
             box = clip_box(instance.box_obj, view.camera)

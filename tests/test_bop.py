@@ -88,8 +88,8 @@ def test_instances(root: Path) -> None:
     assert (second.scene, second.image, second.index, second.obj_id) == (2, 3, 1, 9)
     np.testing.assert_allclose(second.T_cam_obj.t, [0.01, -0.02, 0.8])
     np.testing.assert_allclose(second.T_cam_obj.R, R, atol=1e-9)
-    assert second.box_obj == (10, 20, 40, 60)
-    assert second.box_visib == (10, 20, 25, 60)
+    assert second.box_obj == (10, 20, 41, 61)
+    assert second.box_visib == (10, 20, 26, 61)
     assert second.visib_fract == pytest.approx(0.4)
     assert second.mask().sum() == 8
     assert first.box_visib is None

@@ -5,8 +5,9 @@ from __future__ import annotations
 import platform
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import typer
 
@@ -104,9 +105,19 @@ def _weights() -> list[Finding]:
             todo = _reinstall("posekit") if essential else ""
             found.append(Finding(topic, str(error), "problem" if essential else "note", todo))
             continue
-        about = "; ".join(f"{key}: {value}" for key, value in networks.about.items())
-        found.append(Finding(topic, f"{path}\nhash {networks.digest}" + (f"\n{about}" if about else "")))
+        found.append(Finding(topic, f"{path}\nhash {networks.digest}\n{_told(networks.about)}".strip()))
     return found
+
+
+def _told(about: Mapping[str, Any]) -> str:
+    """What the weights' TOML says of their training and figures, in one line."""
+    parts = []
+    for key, value in about.items():
+        text = (
+            f"({_told(value)})" if isinstance(value, Mapping) else f"{value:.4g}" if isinstance(value, float) else value
+        )
+        parts.append(f"{key.replace('_', ' ')} {text}")
+    return ", ".join(parts)
 
 
 def _reinstall(packages: str) -> str:

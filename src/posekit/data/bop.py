@@ -242,9 +242,12 @@ def _instance(
 
 
 def _box(xywh: Any) -> Box | None:
-    """BOP's (x, y, w, h) as edges; None for its (-1, -1, -1, -1)."""
+    """BOP's (x, y, w, h) as edges; None for its (-1, -1, -1, -1).
+
+    Its w and h are the differences of the last and the first pixel (BOP toolkit's calc_2d_bbox): one short of a width.
+    """
     x, y, w, h = (float(v) for v in xywh)
-    return (x, y, x + w, y + h) if w > 0 and h > 0 else None
+    return (x, y, x + w + 1, y + h + 1) if w >= 0 and h >= 0 else None
 
 
 def _json(path: Path) -> Any:
