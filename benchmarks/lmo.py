@@ -50,7 +50,9 @@ def symmetric_errors(estimate: Pose, truth: Pose, model: ObjectModel) -> tuple[f
     return min(errors(estimate, truth @ S) for S in model.symmetries.transforms())
 
 
-def one(estimator: PoseEstimator, view: View, instance: Instance, args: argparse.Namespace, rng: np.random.Generator) -> Row:
+def one(
+    estimator: PoseEstimator, view: View, instance: Instance, args: argparse.Namespace, rng: np.random.Generator
+) -> Row:
     truth, model = instance.T_cam_obj, estimator.model
     mask = instance.mask()
     started = time.perf_counter()
@@ -79,7 +81,8 @@ def table(rows: list[Row], name: str) -> str:
     shares = [(e < level).all(1) for level in LEVELS]
     pooled = " ".join(f"({n},{n}) {100 * s.mean():5.1f}" for n, s in zip(LEVELS, shares, strict=True))
     mean = " ".join(f"{100 * np.mean([s[objects == o].mean() for o in np.unique(objects)]):5.1f}" for s in shares)
-    return f"{name:>9}: {pooled} | mean over objects {mean} | median {np.median(e[:, 0]):.2f} deg {np.median(e[:, 1]):.2f} cm"
+    turn, shift = np.median(e, axis=0)
+    return f"{name:>9}: {pooled} | mean over objects {mean} | median {turn:.2f} deg {shift:.2f} cm"
 
 
 def main() -> None:
@@ -103,17 +106,25 @@ def main() -> None:
     args = parser.parse_args()
 
     data = BopDataset(args.root)
-    chosen = [i for s, im in data.images() for i in data.instances(s, im, every=True) if i.visib_fract > args.min_visible]
+    chosen = [
+        i for s, im in data.images() for i in data.instances(s, im, every=True) if i.visib_fract > args.min_visible
+    ]
     if args.limit:
         chosen = [chosen[k] for k in np.linspace(0, len(chosen) - 1, args.limit).round().astype(int)]
-    options = EstimateOptions(hypotheses=args.hypotheses, update=args.update, stop=args.stop, iterations=args.iterations)
+    options = EstimateOptions(
+        hypotheses=args.hypotheses, update=args.update, stop=args.stop, iterations=args.iterations
+    )
     estimators: dict[int, PoseEstimator] = {}
     rng = np.random.default_rng(args.seed)
     rows: list[Row] = []
     for instance in chosen:
         if instance.obj_id not in estimators:
             estimators[instance.obj_id] = PoseEstimator(
-                data.model(instance.obj_id), preset=args.preset, weights=args.weights, options=options, threads=args.threads
+                data.model(instance.obj_id),
+                preset=args.preset,
+                weights=args.weights,
+                options=options,
+                threads=args.threads,
             )
         view = data.view(instance.scene, instance.image)
         rows.append(one(estimators[instance.obj_id], view, instance, args, rng))
@@ -128,15 +139,17 @@ def main() -> None:
     from scipy.stats import spearmanr
 
     print(f"predicted angle: rank correlation with the error {spearmanr(angle, error).statistic:.2f}; "
-          f"{(angle < 2).sum()} below 2 deg, of which {100 * (error[angle < 2] < 5).mean() if (angle < 2).any() else float('nan'):.0f} % "
-          f"are within 5 deg; iterations {np.mean([r.iterations for r in rows]):.1f}, "
+          f"{(angle < 2).sum()} below 2 deg, {((angle < 2) & (error < 5)).sum()} of these within 5 deg; "
+          f"iterations {np.mean([r.iterations for r in rows]):.1f}, "
           f"{np.median([r.seconds for r in rows]):.2f} s per instance")  # fmt: skip
     if args.csv:
         with args.csv.open("w", newline="") as file:
             writer = csv.writer(file)
             writer.writerow(["obj_id", "scene", "image", "start", "plain", "symmetric", "angle_deg", "iterations", "s"])
             for r in rows:
-                writer.writerow([r.obj_id, r.scene, r.image, r.start, r.plain, r.symmetric, r.angle_deg, r.iterations, r.seconds])
+                writer.writerow(
+                    [r.obj_id, r.scene, r.image, r.start, r.plain, r.symmetric, r.angle_deg, r.iterations, r.seconds]
+                )
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from posekit.object_model import ObjectModel
 
 
 def cuboid(low: tuple[float, float, float], high: tuple[float, float, float], cells: int = 1):  # type: ignore[no-untyped-def]
-    """Vertices (V, 3) and faces (F, 3) of a box whose sides are cells x cells quadrilaterals with their own vertices."""
+    """Vertices (V, 3) and faces (F, 3) of a box, each side of cells x cells quadrilaterals with their own vertices."""
     t = np.linspace(0, 1, cells + 1)
     u, v = (g.ravel() for g in np.meshgrid(t, t, indexing="ij"))
     index = np.arange(len(u)).reshape(cells + 1, cells + 1)

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from objects import bracket
 
+from objects import bracket
 from posekit.data.augment import AugmentConfig, augment, disturb_mask
 from posekit.data.pairs import Pair, PairConfig, render_pairs, stack_statistics
 from posekit.data.procedural import random_object, random_texture
@@ -75,7 +75,7 @@ def test_without_augmentation_the_object_stays_where_it_is(pairs: list[Pair]) ->
 
 
 @pytest.mark.parametrize(
-    "config, check",
+    ("config", "check"),
     [
         (AugmentConfig(no_mask=1), lambda out, mask: not out.any()),
         (AugmentConfig(no_mask=0, box_mask=1), lambda out, mask: out.sum() == 30 * 40 and out[mask].all()),

@@ -7,12 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from objects import bracket
 
+from objects import bracket
 from posekit.camera import Camera, mask_box
 from posekit.errors import WeightsError
-from posekit.geometry import Pose, random_rotation, rotation_angle
-from posekit.hypotheses import MVNetSearch, TemplateSearch
+from posekit.geometry import Pose, random_rotation, rotation_angle, so3_exp
+from posekit.hypotheses import MVNetSearch, TemplateSearch, agreements
 from posekit.nets.heads import Prediction
 from posekit.nets.lite import LiteConfig
 from posekit.nets.pose_delta import delta_between
@@ -70,6 +70,18 @@ def test_hypotheses_lie_apart_and_an_empty_mask_gives_none(renderer: Renderer) -
         assert all(rotation_angle(a.T_cam_obj.R.T @ b.T_cam_obj.R) > search.options.apart for b in found[:k])
     empty = dataclasses.replace(detection, mask=np.zeros((480, 640), bool))
     assert search.search(view, empty, 5) == []
+
+
+def test_agreement_is_best_at_the_truth(renderer: Renderer) -> None:
+    model = bracket()
+    truth = Pose(random_rotation(np.random.default_rng(2)), [0.1, -0.05, 0.7]) @ model.T_obj_ctr.inverse()
+    view, detection = seen(renderer, truth)
+    turned = Pose(truth.R @ so3_exp([0.3, 0.2, 0]), truth.t)
+    away = Pose(truth.R, truth.t + [0.3, 0, 0])
+    best, worse, worst = agreements(view.with_mask(detection.mask), model, [truth, turned, away], renderer, (160, 120))
+    assert best.silhouette > 0.93 and best.colour > 0.9
+    assert best.silhouette > worse.silhouette > worst.silhouette == 0 and best.colour > worse.colour
+    assert agreements(view, model, [truth], renderer, (160, 120))[0].silhouette == 1.0, "without a mask"
 
 
 def test_mvnet_answers_relative_to_the_frontal_view(renderer: Renderer) -> None:

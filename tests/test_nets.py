@@ -241,7 +241,7 @@ def test_one_batch_is_over_fitted() -> None:
     assert found[-1]["angle"] < 0.3 * found[0]["angle"]
 
 
-@pytest.mark.parametrize("preset, config", [("lite", SMALL), ("paper", TINY_PAPER)])
+@pytest.mark.parametrize(("preset", "config"), [("lite", SMALL), ("paper", TINY_PAPER)])
 def test_weights_come_back_as_they_went(tmp_path: Path, preset: str, config: LiteConfig | PaperConfig) -> None:
     networks = build(preset, config)
     digest = save_networks(tmp_path / "mine", networks, {"trained_on": "nothing", "steps": 0})
@@ -252,7 +252,7 @@ def test_weights_come_back_as_they_went(tmp_path: Path, preset: str, config: Lit
         half = value.half().float() if value.is_floating_point() else value
         torch.testing.assert_close(loaded.svnet.state_dict()[name], half)
     assert loaded.mvnet is not None
-    assert set(p.name for p in tmp_path.iterdir()) == {"mine.safetensors", "mine.toml"}
+    assert {p.name for p in tmp_path.iterdir()} == {"mine.safetensors", "mine.toml"}
     assert all(v.dtype != torch.float32 for v in load_file(tmp_path / "mine.safetensors").values())
 
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from objects import bracket
 
+from objects import bracket
 from posekit.camera import Camera
 from posekit.errors import ConfigError
 from posekit.geometry import Pose, PoseNoise, rotation_angle, rotation_between, so3_exp, view_rotation

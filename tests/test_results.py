@@ -52,8 +52,8 @@ def test_the_result_has_what_the_readme_promises() -> None:
     assert entry["box"] == [1.0, 2.0, 30.5, 40.0]
     assert entry["timings_s"] == {"refine": 0.25, "total": 0.5}
     assert entry["trace"][0]["angle_deg"] == pytest.approx(np.rad2deg(0.4))
-    assert data["weights_hash"] == "abc"
-    assert data["versions"] == {"posekit": __version__, "torch": "2"}
+    assert data["estimates"][0]["weights_hash"] == "abc"
+    assert data["estimates"][0]["versions"] == {"posekit": __version__, "torch": "2"}
 
 
 def test_round_trip() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from pathlib import Path
 
 import pytest
@@ -73,7 +74,7 @@ def test_the_rate_warms_up_and_falls() -> None:
     config = dataclasses.replace(CONFIG, steps=1000, warmup=100, rate=1.0)
     rates = [rate_at(k, config) for k in range(1001)]
     assert rates[0] < 0.02 and rates[99] == pytest.approx(1.0) and rates[1000] == pytest.approx(0.02)
-    assert all(a >= b for a, b in zip(rates[100:], rates[101:], strict=False))
+    assert all(a >= b for a, b in itertools.pairwise(rates))
 
 
 def test_a_whole_run_leaves_weights_a_log_and_a_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -97,9 +97,7 @@ class Camera:
     def resized(self, width: int, height: int) -> Camera:
         """The same camera with its picture scaled to another size."""
         sx, sy = width / self.width, height / self.height
-        return Camera(
-            self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5, width, height
-        )
+        return Camera(self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5, width, height)
 
     def cropped(self, x0: int, y0: int, width: int, height: int) -> Camera:
         """The camera of the picture's part that starts at pixel (x0, y0)."""

@@ -1,15 +1,15 @@
 """Everything that posekit raises on purpose.
 
-    PosekitError
-    ├── InputError        a file, an option or an array that cannot be used
-    │   ├── ImageError    a picture or video
-    │   ├── MeshError     a CAD mesh or its symmetries
-    │   ├── CameraError   intrinsics
-    │   ├── PromptError   a box, mask, pose or detections file
-    │   └── ConfigError   a TOML file or a combination of options
-    ├── OutputError       a folder or file that cannot be written, or would be overwritten
-    ├── WeightsError      weights that are missing, damaged or of another preset
-    └── RenderError       no usable OpenGL, or a rendering that failed
+PosekitError
+├── InputError        a file, an option or an array that cannot be used
+│   ├── ImageError    a picture or video
+│   ├── MeshError     a CAD mesh or its symmetries
+│   ├── CameraError   intrinsics
+│   ├── PromptError   a box, mask, pose or detections file
+│   └── ConfigError   a TOML file or a combination of options
+├── OutputError       a folder or file that cannot be written, or would be overwritten
+├── WeightsError      weights that are missing, damaged or of another preset
+└── RenderError       no usable OpenGL, or a rendering that failed
 """
 
 

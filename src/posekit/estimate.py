@@ -12,7 +12,7 @@ import numpy as np
 from posekit.camera import Box
 from posekit.errors import ConfigError
 from posekit.geometry import Pose
-from posekit.hypotheses import Hypothesis, MVNetSearch, TemplateSearch
+from posekit.hypotheses import Agreement, Hypothesis, MVNetSearch, TemplateSearch, agreements
 from posekit.nets.predictor import NetworkPredictor
 from posekit.nets.weights import load_networks
 from posekit.object_model import ObjectModel
@@ -42,7 +42,7 @@ class EstimateOptions:
             raise ConfigError(f"init is one of {INITS}, not {self.init!r}.")
         if self.hypotheses < 1:
             raise ConfigError(f"at least 1 hypothesis is needed, not {self.hypotheses}.")
-        self.refine_options  # checks the rest
+        _ = self.refine_options  # checks the rest
 
     @property
     def refine_options(self) -> RefineOptions:
@@ -115,7 +115,9 @@ class PoseEstimator:
         self, view: View, refined: Sequence[Refinement], detection: Detection | None, timings: dict[str, float]
     ) -> Estimate:
         """The hypothesis with the best score: a low predicted angle, and a silhouette that agrees with the mask."""
-        scores = [score(r, agreement) for r, agreement in zip(refined, self._agreements(view, refined), strict=True)]
+        poses = [r.T_cam_obj for r in refined]
+        measured = agreements(view, self.model, poses, self.renderer, self.predictor.size)
+        scores = [score(r.angle, agreement) for r, agreement in zip(refined, measured, strict=True)]
         k = int(np.argmax(scores))
         best = refined[k]
         return Estimate(
@@ -131,20 +133,12 @@ class PoseEstimator:
             timings=timings,
         )
 
-    def _agreements(self, view: View, refined: Sequence[Refinement]) -> list[float]:
-        """Intersection over union of each final silhouette and the view's mask; 1 where there is no mask."""
-        if view.mask is None:
-            return [1.0] * len(refined)
-        drawn = self.renderer.render(self.model, [r.T_cam_obj for r in refined], view.camera, coords=False)
-        masks = [d.mask for d in drawn]
-        return [float((m & view.mask).sum() / max(1, (m | view.mask).sum())) for m in masks if m is not None]
-
     def _box(self, view: View, T_cam_obj: Pose) -> Box:
         points = T_cam_obj.apply(self.model.outline)
         points[:, 2] = np.maximum(points[:, 2], 1e-3)
         return view.camera.points_box(points)
 
 
-def score(refinement: Refinement, agreement: float) -> float:
-    """Between 0 and 1: exp(-angle / 15 degrees) times the silhouettes' agreement."""
-    return float(np.exp(-refinement.angle / np.deg2rad(15.0)) * agreement)
+def score(angle: float, agreement: Agreement) -> float:
+    """Between 0 and 1, of a predicted angle (radians) and the agreement: see docs/decisions/0005."""
+    return float(np.exp(-angle / np.deg2rad(30.0)) * (agreement.silhouette + 0.5 * max(0.0, agreement.colour)) / 1.5)

@@ -230,10 +230,46 @@ def frontal_camera(model: ObjectModel, size: tuple[int, int]) -> tuple[Camera, f
     return zoom_to_pose(whole, frontal, model.outline - model.center, size, enlarge=1.0).camera, distance
 
 
+@dataclass(frozen=True)
+class Agreement:
+    """How well a pose explains a photograph, measured by rendering it there.
+
+    silhouette: intersection over union with the observed mask, 1 where there is none. colour: correlation of the
+    rendered and the observed colours inside the silhouette, brightness and contrast taken out, -1 to 1.
+    """
+
+    silhouette: float
+    colour: float
+
+
+def agreements(
+    view: View, model: ObjectModel, poses: Sequence[Pose], renderer: Renderer, size: tuple[int, int]
+) -> list[Agreement]:
+    """Render each ``T_cam_obj`` in a zoomed view of ``size`` (width, height), and compare."""
+    outline = model.outline - model.center
+    zooms = [zoom_to_pose(view.camera, T @ model.T_obj_ctr, outline, size) for T in poses]
+    turned = [Pose.rotation(zoom.R_view_cam) @ T for zoom, T in zip(zooms, poses, strict=True)]
+    drawn = renderer.render(model, turned, [z.camera for z in zooms], coords=False)
+    return [_agreement(view.zoomed(zoom), d) for zoom, d in zip(zooms, drawn, strict=True)]
+
+
+def _agreement(observed: View, rendered: View) -> Agreement:
+    assert rendered.mask is not None
+    inside, silhouette = rendered.mask, 1.0
+    if observed.mask is not None:
+        silhouette = float((inside & observed.mask).sum() / max(1, (inside | observed.mask).sum()))
+        inside = inside & observed.mask
+    if inside.sum() < 30:
+        return Agreement(silhouette, -1.0)
+    a, b = (v.image[inside].astype(np.float64) for v in (observed, rendered))
+    a, b = a - a.mean(0), b - b.mean(0)
+    return Agreement(silhouette, float((a * b).sum() / (np.linalg.norm(a) * np.linalg.norm(b) + 1e-9)))
+
+
 def box_mask(box: tuple[float, float, float, float], camera: Camera) -> NDArray[np.bool_]:
     """The filled box as a mask (H, W)."""
     mask = np.zeros((camera.height, camera.width), bool)
-    x0, y0, x1, y1 = (int(round(v)) for v in box)
+    x0, y0, x1, y1 = (round(v) for v in box)
     mask[max(0, y0) : max(0, y1), max(0, x0) : max(0, x1)] = True
     return mask
 
@@ -241,4 +277,3 @@ def box_mask(box: tuple[float, float, float, float], camera: Camera) -> NDArray[
 def _u8(mask: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
     assert mask is not None
     return mask.astype(np.uint8)
-

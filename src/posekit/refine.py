@@ -42,7 +42,9 @@ class RefineOptions:
 
     def __post_init__(self) -> None:
         if self.update not in UPDATES or self.stop not in STOPS:
-            raise ConfigError(f"update is one of {UPDATES} and stop one of {STOPS}, not {self.update!r}, {self.stop!r}.")
+            raise ConfigError(
+                f"update is one of {UPDATES} and stop one of {STOPS}, not {self.update!r}, {self.stop!r}."
+            )
         if self.iterations < 1 or not 0 < self.stop_angle <= np.pi:
             raise ConfigError(
                 f"iterations must be at least 1 and the stop angle between 0 and 180 degrees, not {self.iterations} "

@@ -74,12 +74,8 @@ def estimates_to_json(
 
     versions: of other software, besides posekit's own. about: further entries of the file (image, camera, ...).
     """
-    document = {
-        **(about or {}),
-        "estimates": [_estimate_to_dict(estimate) for estimate in estimates],
-        "weights_hash": weights_hash,
-        "versions": {"posekit": __version__, **(versions or {})},
-    }
+    origin = {"weights_hash": weights_hash, "versions": {"posekit": __version__, **(versions or {})}}
+    document = {**(about or {}), "estimates": [_estimate_to_dict(estimate) | origin for estimate in estimates]}
     return json.dumps(_strict(document), indent=1, allow_nan=False) + "\n"
 
 

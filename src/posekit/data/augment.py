@@ -53,7 +53,7 @@ def augment(pair: Pair, others: Sequence[Pair], photos: Sequence[Image], config:
     H, W = pair.target.shape[:2]
     scene = _background((W, H), others, photos, config, rng)
     alpha = pair.target[..., 3] > 0
-    scene[alpha] = _recolour(pair.target[..., :3], alpha, rng)[alpha]
+    scene[alpha] = _recolour(pair.target[..., :3], rng)[alpha]
     hidden = np.zeros((H, W), bool)
     if len(others) and rng.random() < config.occluded:
         for _ in range(int(rng.integers(1, 3))):
@@ -114,7 +114,7 @@ def _paste_occluder(scene: Image, hidden: NDArray[np.bool_], alpha: NDArray[np.b
     hidden |= on
 
 
-def _recolour(image: Image, alpha: NDArray[np.bool_], rng: Rng) -> Image:
+def _recolour(image: Image, rng: Rng) -> Image:
     """The real object's paint is never the mesh's: other gains, gamma, saturation, and light that falls off."""
     x = image.astype(np.float32) / 255
     grey = x.mean(-1, keepdims=True)
@@ -122,7 +122,9 @@ def _recolour(image: Image, alpha: NDArray[np.bool_], rng: Rng) -> Image:
     x = np.clip(x, 0, 1) ** np.float32(np.exp(rng.normal() * 0.3))
     x *= np.exp(rng.normal(size=3) * 0.08).astype(np.float32) * np.float32(np.exp(rng.normal() * 0.18))
     if rng.random() < 0.4:
-        field = cv2.resize(rng.uniform(0.5, 1.3, size=(3, 4)).astype(np.float32), image.shape[1::-1], interpolation=cv2.INTER_CUBIC)
+        field = cv2.resize(
+            rng.uniform(0.5, 1.3, size=(3, 4)).astype(np.float32), image.shape[1::-1], interpolation=cv2.INTER_CUBIC
+        )
         x *= field[..., None]
     if rng.random() < 0.3:
         x = cv2.GaussianBlur(x, (0, 0), float(rng.uniform(0.5, 1.5)))
@@ -132,11 +134,11 @@ def _recolour(image: Image, alpha: NDArray[np.bool_], rng: Rng) -> Image:
 def _photograph(scene: Image, config: AugmentConfig, rng: Rng) -> Image:
     """Exposure, white balance, defocus, motion, few pixels, sensor noise and JPEG, in a camera's order."""
     H, W = scene.shape[:2]
-    x = scene.astype(np.float32) / 255
+    x: NDArray[np.float32] = scene.astype(np.float32) / np.float32(255)
     if rng.random() < 0.8:
         x = np.clip(x, 0, 1) ** np.float32(np.exp(rng.normal() * 0.2))
         x *= np.exp(rng.normal(size=3) * 0.07).astype(np.float32) * np.float32(np.exp(rng.normal() * 0.18))
-        x = (x - 0.5) * np.float32(rng.uniform(0.75, 1.2)) + 0.5 + np.float32(rng.normal() * 0.04)
+        x = (x - np.float32(0.5)) * np.float32(rng.uniform(0.75, 1.2)) + np.float32(0.5 + rng.normal() * 0.04)
     if rng.random() < 0.4:
         x = cv2.GaussianBlur(x, (0, 0), float(rng.uniform(0.4, 1.8)))
     if rng.random() < 0.12:

@@ -178,10 +178,10 @@ def random_texture(rng: Rng, photos: Sequence[Image] = (), size: int = 256) -> I
             blend = np.zeros((size, size))
         blend = np.clip(blend, 0, 1)[..., None]
         image = base * (1 - blend) + other * blend
-    image = np.ascontiguousarray(image.clip(0, 255).astype(np.uint8))
+    painted = np.ascontiguousarray(image.clip(0, 255).astype(np.uint8))
     for _ in range(int(rng.integers(0, 9)) if rng.random() < 0.6 else 0):
-        _draw_mark(image, rng)
-    return image
+        _draw_mark(painted, rng)
+    return painted
 
 
 def _draw_mark(image: Image, rng: Rng) -> None:
@@ -248,7 +248,8 @@ def random_object(rng: Rng, photos: Sequence[Image] = (), diameter: float | None
     """
     count = int(rng.choice([1, 2, 3, 4, 5, 6], p=[0.12, 0.2, 0.22, 0.2, 0.16, 0.1]))
     detail = 40 if count <= 2 else 28
-    points_list, uv_list, face_list, part_list, offset = [], [], [], [], 0
+    points_list: list[Array] = []
+    uv_list, face_list, part_list, offset = [], [], [], 0
     for k in range(count):
         points, uvs, faces = _primitive(rng, detail)
         scale = rng.uniform(0.25, 1.0, size=3) * (1.0 if k == 0 else rng.uniform(0.2, 0.9))

@@ -107,7 +107,7 @@ class PairStream(IterableDataset[dict[str, Tensor]]):
 
 
 def collate(samples: Sequence[Sample]) -> dict[str, Tensor]:
-    """observed, rendered: uint8 (B, H, W, 4); flow (B, 2, h, w); valid, visible (B, h, w); quat_wxyz, v, angle, lost."""
+    """observed, rendered: uint8 (B, H, W, 4); flow (B, 2, h, w); valid, visible (B, h, w); the rest (B, ...)."""
     pairs = [s.pair for s in samples]
 
     def stack(arrays: Sequence[NDArray]) -> Tensor:  # type: ignore[type-arg]

@@ -139,12 +139,13 @@ def load_networks(preset: str, path: Path | None = None) -> Networks:
 
 
 def _config(preset: str, values: Mapping[str, Any]) -> LiteConfig | PaperConfig:
-    kind = LiteConfig if preset == "lite" else PaperConfig
+    kind: type[LiteConfig | PaperConfig] = LiteConfig if preset == "lite" else PaperConfig
     known = {f.name for f in dataclasses.fields(kind)}
     unknown = set(values) - known
     if unknown:
         raise WeightsError(f"the weights' configuration has unknown keys {sorted(unknown)}; known: {sorted(known)}.")
-    return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+    chosen: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    return kind(**chosen)
 
 
 def _load_strictly(module: nn.Module, state: dict[str, Tensor], file: Path) -> None:

@@ -12,7 +12,7 @@ import dataclasses
 import math
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,7 +30,6 @@ from posekit.nets.inputs import images_to_tensor
 from posekit.nets.lite import LiteSVNet
 from posekit.nets.losses import DenseLossConfig, Target, dense_loss
 from posekit.nets.weights import build, save_networks
-
 
 HELD_BACK = 12  # batches of the validation
 
@@ -125,7 +124,7 @@ class Trainer:
         self.seconds = 0.0
 
     @torch.no_grad()
-    def _average(self, averages: list[Tensor], currents: list[Tensor], count: Tensor) -> None:
+    def _average(self, averages: Sequence[Tensor], currents: Sequence[Tensor], count: Tensor | int) -> None:
         """An exponential moving average that forgets its first values faster: the decay grows to ``ema``."""
         decay = min(self.config.ema, (1.0 + float(count)) / (10.0 + float(count)))
         for average, current in zip(averages, currents, strict=True):
@@ -133,6 +132,12 @@ class Trainer:
                 average.lerp_(current.to(average.dtype), 1.0 - decay)
             else:
                 average.copy_(current)
+
+    @property
+    def averaged(self) -> LiteSVNet:
+        module = self.average.module
+        assert isinstance(module, LiteSVNet)
+        return module
 
     @property
     def checkpoint(self) -> Path:
@@ -173,7 +178,9 @@ class Trainer:
             output = self.net.predict(images_to_tensor(batch["observed"]), images_to_tensor(batch["rendered"]))
         loss, parts = dense_loss(output, self.net.heads, to_target(batch), self.config.loss)
         if not torch.isfinite(loss):
-            raise FloatingPointError(f"the loss became {float(loss.detach())} at step {self.step}; {self.checkpoint} is intact")
+            raise FloatingPointError(
+                f"the loss became {float(loss.detach())} at step {self.step}; {self.checkpoint} is intact"
+            )
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         average_gradients(list(self.net.parameters()))
@@ -185,7 +192,7 @@ class Trainer:
 
     def export(self, about: dict[str, object]) -> str:
         """The averaged weights as fp16 safetensors in the run's folder; returns their hash."""
-        networks = dataclasses.replace(self.networks, svnet=self.average.module, mvnet=None)
+        networks = dataclasses.replace(self.networks, svnet=self.averaged, mvnet=None)
         return save_networks(self.run / "lite", networks, about)  # this recipe trains no MV-Net
 
 
@@ -223,7 +230,7 @@ def train(config: PoseTrainConfig, run: Path, photos: Path | None) -> None:
         if trainer.step % 50 == 0:
             _log(log, {"step": trainer.step, "seconds": trainer.seconds, "set": "train", **running})
         if trainer.step % config.validate == 0 or trainer.step == config.steps:
-            found = validate(trainer.average.module, held_back, config.loss)
+            found = validate(trainer.averaged, held_back, config.loss)
             _log(log, {"step": trainer.step, "seconds": trainer.seconds, "set": "held-back", **found})
             about = {"trained_on": "procedural shapes", "steps": trainer.step, "hours": trainer.seconds / 3600,
                      "held_back": found}  # fmt: skip
@@ -244,7 +251,9 @@ def _log(path: Path, row: dict[str, object]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, required=True, help="folder of checkpoints and logs; resumed where it exists")
+    parser.add_argument(
+        "--out", type=Path, required=True, help="folder of checkpoints and logs; resumed where it exists"
+    )
     parser.add_argument("--backgrounds", type=Path, help="folder of photographs for backgrounds and textures")
     parser.add_argument("--steps", type=int, default=PoseTrainConfig.steps)
     parser.add_argument("--batch", type=int, default=StreamConfig.batch)
