@@ -100,6 +100,17 @@ def test_the_predicted_angle_stops_the_loop(renderer) -> None:
     assert found[0].angle < np.deg2rad(2)
 
 
+def test_a_small_angle_beside_a_large_correction_is_no_convergence(renderer) -> None:
+    model = bracket()
+    truth = Pose(view_rotation([0.5, -1.0, 0.6]), PLACES[0]) @ model.T_obj_ctr.inverse()
+    start = Pose(so3_exp([0, 0, 0.3]) @ truth.R, truth.t)
+    view, oracle = photograph(renderer, model, truth), Oracle(model, truth, angles=[0.01])
+    found = refine(view, model, [start], oracle, renderer)[0]
+    assert found.iterations == 2 and found.trace[0].angle == pytest.approx(0.3, abs=0.01)
+    found = refine(view, model, [start], oracle, renderer, RefineOptions(update="regression"))[0]
+    assert found.iterations == 1, "the regressed update has the angle head alone"
+
+
 def test_without_convergence_the_lowest_predicted_angle_wins(renderer) -> None:
     model = bracket()
     truth = Pose(view_rotation([0.5, -1.0, 0.6]), PLACES[0]) @ model.T_obj_ctr.inverse()

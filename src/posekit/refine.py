@@ -88,7 +88,7 @@ def refine(
         predictions, observed, rendered = compare(view, model, outline, poses, predictor, renderer)
         for loop, prediction, seen, drawn in zip(active, predictions, observed, rendered, strict=True):
             updated = update_pose(loop.pose, model, prediction, seen, drawn, options.update)
-            loop.advance(prediction, updated, options)
+            loop.advance(predicted_angle(loop.pose, prediction, updated, options.update), updated, options)
     return [loop.finish(options) for loop in loops]
 
 
@@ -126,6 +126,17 @@ def update_pose(
     return T_view_cam.inverse() @ target @ model.T_obj_ctr.inverse()
 
 
+def predicted_angle(T_cam_obj: Pose, prediction: PairPrediction, updated: Pose | None, update: str) -> float:
+    """The rotation error (radians) that the network sees in a pose.
+
+    The angle head's answer; where correspondences move the pose, at least the turn that they ask for: a small angle
+    beside a large correction is no convergence.
+    """
+    if update == "regression" or updated is None:
+        return prediction.angle
+    return max(prediction.angle, float(rotation_angle(updated.R @ T_cam_obj.R.T)))
+
+
 class _Loop:
     """One hypothesis on its way."""
 
@@ -135,13 +146,13 @@ class _Loop:
         self.after: list[Pose] = []  # the pose that each step's prediction leads to
         self.done = self.converged = False
 
-    def advance(self, prediction: PairPrediction, updated: Pose | None, options: RefineOptions) -> None:
-        self.steps.append(Step(self.pose, prediction.angle))
+    def advance(self, angle: float, updated: Pose | None, options: RefineOptions) -> None:
+        self.steps.append(Step(self.pose, angle))
         self.after.append(updated or self.pose)
         if updated is None:
             self.done = True
             return
-        if options.stop == "angle" and prediction.angle < options.stop_angle:
+        if options.stop == "angle" and angle < options.stop_angle:
             self.done = self.converged = True
             return
         self.pose = updated
