@@ -1,0 +1,115 @@
+"""The whole chain with the shipped weights, on pictures made on the spot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from posekit.camera import Camera
+from posekit.data.example import make_example
+from posekit.errors import ConfigError, WeightsError
+from posekit.estimate import EstimateOptions, PoseEstimator, score
+from posekit.geometry import Pose, PoseNoise
+from posekit.hypotheses import Agreement
+from posekit.metrics import pose_error
+from posekit.nets.weights import build, save_networks
+from posekit.render import Renderer
+from posekit.results import Detection
+from posekit.view import View
+
+
+@pytest.fixture(scope="module")
+def examples():  # type: ignore[no-untyped-def]
+    renderer = Renderer()
+    return [make_example(renderer, seed) for seed in range(3)]
+
+
+def masked(renderer: Renderer, example) -> Detection:  # type: ignore[no-untyped-def]
+    [seen] = renderer.render(example.model, [example.T_cam_obj], example.view.camera, rgb=False, coords=False)
+    return Detection(example.box, seen.mask, 1.0, example.model.name, "mask")
+
+
+def test_refinement_brings_disturbed_poses_nearer(examples) -> None:
+    """DeepIM's disturbance; the network has never seen this object."""
+    estimator = PoseEstimator(examples[0].model, options=EstimateOptions(iterations=6))
+    rng = np.random.default_rng(0)
+    before, after = [], []
+    for example in examples * 2:
+        start = PoseNoise().disturb(example.T_cam_obj @ example.model.T_obj_ctr, rng)
+        start = start @ example.model.T_obj_ctr.inverse()
+        view = example.view.with_mask(masked(estimator.renderer, example).mask)
+        found = estimator.refine(view, start)
+        assert 1 <= found.iterations <= 6 and len(found.trace) == found.iterations
+        before.append(pose_error(start, example.T_cam_obj)[0])
+        after.append(pose_error(found.T_cam_obj, example.T_cam_obj)[0])
+    assert np.median(after) < 0.5 * np.median(before)
+
+
+def test_the_whole_chain_from_a_mask(examples) -> None:
+    options = EstimateOptions(iterations=6, hypotheses=3)
+    estimator = PoseEstimator(examples[0].model, options=options)
+    turns, shifts = [], []
+    for example in examples:
+        [found] = estimator.estimate(example.view, [masked(estimator.renderer, example)])
+        turn, shift = pose_error(found.T_cam_obj, example.T_cam_obj)
+        turns.append(float(np.rad2deg(turn)))
+        shifts.append(float(shift))
+        assert 0 <= found.score <= 1 and set(found.timings) == {"first_pose", "refine", "total"}
+        assert found.detection is not None and found.detection.source == "mask"
+    assert np.median(turns) < 10 and np.median(shifts) < 0.05
+
+
+def test_the_same_seed_gives_the_same_estimate(examples) -> None:
+    example, poses = examples[0], []
+    for _ in range(2):
+        estimator = PoseEstimator(example.model, options=EstimateOptions(iterations=2, hypotheses=2, seed=3))
+        poses.append(estimator.estimate(example.view, [masked(estimator.renderer, example)])[0].T_cam_obj.matrix)
+    np.testing.assert_array_equal(*poses)
+
+
+def test_nothing_detected_is_an_empty_list(examples) -> None:
+    estimator = PoseEstimator(examples[0].model)
+    assert estimator.estimate(examples[0].view, []) == []
+
+
+def test_the_paper_preset_runs_the_whole_chain(examples, tmp_path: Path) -> None:
+    """Full size, untrained: the same loops, MV-Net's first pose, the regression update."""
+    save_networks(tmp_path / "paper", build("paper"), {"trained_on": "nothing"})
+    options = EstimateOptions(init="mvnet", update="regression", stop="fixed", iterations=1)
+    estimator = PoseEstimator(examples[0].model, preset="paper", weights=tmp_path, options=options)
+    found = estimator.estimate(examples[0].view, [masked(estimator.renderer, examples[0])])
+    assert len(found) <= 1 and estimator.predictor.size == (640, 480)
+    assert all(np.isfinite(f.T_cam_obj.matrix).all() and f.iterations == 1 for f in found)
+
+
+def test_what_is_not_there_is_said(examples, tmp_path: Path) -> None:
+    model = examples[0].model
+    with pytest.raises(WeightsError, match="ships no trained weights for preset 'paper'"):
+        PoseEstimator(model, preset="paper")
+    save_networks(tmp_path / "paper", build("paper"), {})
+    options = EstimateOptions(iterations=1)
+    estimator = PoseEstimator(model, preset="paper", weights=tmp_path, options=options)
+    with pytest.raises(ConfigError, match="--update regression"):
+        estimator.refine(View(examples[0].view.image, examples[0].view.camera), examples[0].T_cam_obj)
+    with pytest.raises(ConfigError, match="at least 1 hypothesis"):
+        EstimateOptions(hypotheses=0)
+    with pytest.raises(ConfigError, match="init is one of"):
+        EstimateOptions(init="guess")
+
+
+def test_a_pose_outside_the_picture_does_not_break_the_loop(examples) -> None:
+    example = examples[0]
+    estimator = PoseEstimator(example.model, options=EstimateOptions(iterations=2))
+    away = Pose(example.T_cam_obj.R, example.T_cam_obj.t + [3.0, 0, 0])
+    found = estimator.refine(example.view, away)
+    assert np.isfinite(found.T_cam_obj.matrix).all()
+    assert isinstance(found.box, tuple) and isinstance(example.view.camera, Camera)
+
+
+def test_the_score_prefers_small_angles_and_agreement() -> None:
+    good = score(0.02, Agreement(0.9, 0.8))
+    assert 0 < score(0.5, Agreement(0.9, 0.8)) < good < 1
+    assert 0 < score(0.02, Agreement(0.5, 0.8)) < good
+    assert score(0.02, Agreement(0.9, 0.1)) < good
