@@ -14,7 +14,7 @@ from posekit.nets.lite import LiteSVNet
 from posekit.nets.weights import load_networks
 from posekit.train.pose import PoseTrainConfig, Trainer, measure_statistics, rate_at, train, validate
 
-STREAM = StreamConfig(batch=2, pool=16, per_object=4, objects=2)
+STREAM = StreamConfig(batch=2, pool=16, per_object=4)
 CONFIG = PoseTrainConfig(steps=4, warmup=2, validate=2, save=2, workers=0, threads=1, stream=STREAM)
 
 

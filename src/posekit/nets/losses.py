@@ -76,7 +76,7 @@ def dense_loss(
     cells = F.avg_pool2d(weight[:, None], 2)
     flow_cells = F.avg_pool2d(target.flow.nan_to_num() * weight[:, None], 2) / cells.clamp_min(1e-6)
     total_cells = cells.sum().clamp_min(1.0)
-    sequence = torch.zeros(())
+    sequence = total_cells.new_zeros(())
     for k, flow in enumerate(flows):
         error = (flow - flow_cells).abs().sum(1, keepdim=True)
         sequence = sequence + config.gamma ** (len(flows) - 1 - k) * (error * cells).sum() / total_cells
@@ -121,7 +121,7 @@ def matching_loss(likeness: Tensor, flow: Tensor, shown: Tensor) -> Tensor:
     through the recurrent updates, several times more slowly (docs/log.md).
     """
     B, _, h, w = flow.shape
-    ys, xs = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
+    ys, xs = torch.meshgrid(*(torch.arange(n, device=flow.device) for n in (h, w)), indexing="ij")
     x, y = xs + flow[:, 0] / CELL, ys + flow[:, 1] / CELL
     inside = shown & (x >= 0) & (x <= w - 1) & (y >= 0) & (y <= h - 1)
     x, y = x.clamp(0, w - 1.001), y.clamp(0, h - 1.001)
@@ -129,7 +129,7 @@ def matching_loss(likeness: Tensor, flow: Tensor, shown: Tensor) -> Tensor:
     fx, fy = x - x0, y - y0
     first = (y0 * w + x0).long()
     logits = torch.log_softmax(likeness, dim=2).view(B, h, w, h * w)
-    total = torch.zeros(())
+    total = logits.new_zeros(())
     for dy, dx, share in ((0, 0, (1 - fx) * (1 - fy)), (0, 1, fx * (1 - fy)), (1, 0, (1 - fx) * fy), (1, 1, fx * fy)):
         found = logits.gather(3, (first + dy * w + dx).unsqueeze(3)).squeeze(3)
         total = total - (found * share * inside).sum()
