@@ -38,7 +38,8 @@ def svnet_loss(prediction: Prediction, heads: PoseHeads, quat_wxyz: Tensor, v: T
 
 @dataclass(frozen=True)
 class DenseLossConfig:
-    """Weights of the lite preset's losses. hidden: weight of anchors that the observed picture does not show."""
+    """Weights of the lite preset's losses. hidden: weight of anchors that the observed picture does not show.
+    mvnet: of `first_pose_loss` beside all others."""
 
     gamma: float = 0.8
     hidden: float = 0.3
@@ -49,6 +50,7 @@ class DenseLossConfig:
     rotation: float = 1.0
     translation: float = 1.0
     angle: float = 1.0
+    mvnet: float = 1.0
     max_flow_px: float = 80.0
 
 
@@ -111,6 +113,21 @@ def dense_loss(
     parts = {"epe_px": epe, "match": match, "likelihood": likelihood, "visibility": visibility, "rotation": rotation,
              "translation": translation, "angle": angle}  # fmt: skip
     return loss, {name: float(value.detach()) for name, value in parts.items()}
+
+
+def first_pose_loss(
+    prediction: Prediction, heads: PoseHeads, quat_wxyz: Tensor, v: Tensor
+) -> tuple[Tensor, dict[str, float]]:
+    """MV-Net lite's loss: the distance to the nearer of q and -q, which are one rotation, and the translation's in
+    normalised units. Unlike equation 1 it does not jump at half a turn. quat_wxyz: (B, 4); v: (B, 3)."""
+    near = (prediction.quat_wxyz - quat_wxyz).abs().sum(1)
+    far = (prediction.quat_wxyz + quat_wxyz).abs().sum(1)
+    rotation = torch.minimum(near, far).mean()
+    translation = ((prediction.v - v) / heads.v_std).abs().mean()
+    cosine = (F.normalize(prediction.quat_wxyz.detach()) * quat_wxyz).sum(1).abs().clamp(max=1.0)
+    angle_deg = torch.rad2deg(2 * torch.acos(cosine)).mean()
+    parts = {"mv_rotation": rotation, "mv_translation": translation, "mv_angle_deg": angle_deg}
+    return rotation + translation, {name: float(value.detach()) for name, value in parts.items()}
 
 
 def matching_loss(likeness: Tensor, flow: Tensor, shown: Tensor) -> Tensor:
