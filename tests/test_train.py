@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import json
 import math
 import os
 import resource
@@ -14,13 +15,20 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import torch
 
+from objects import bracket
+from posekit.camera import Camera
+from posekit.data.bop import BopDataset
 from posekit.data.stream import PairStream, StreamConfig
 from posekit.errors import ConfigError, OutputError, TrainingError, WeightsError
+from posekit.geometry import Pose, random_rotation
 from posekit.nets.lite import LiteConfig, LiteSVNet
 from posekit.nets.weights import load_networks
+from posekit.render import Renderer
 from posekit.train.checkpoint import Checkpoint, Checkpoints
 from posekit.train.config import (
     MachineConfig,
@@ -32,6 +40,7 @@ from posekit.train.config import (
     write_config,
 )
 from posekit.train.loop import Trainer, make_fabric, rate_at
+from posekit.train.paper import PaperTask
 from posekit.train.pose import make_task, resume_pose, train_pose
 from posekit.train.sources import Sources
 
@@ -211,6 +220,96 @@ def test_a_full_disk_leaves_the_last_good_checkpoint(tmp_path: Path) -> None:
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert checkpoints.last() == 1 and checkpoints.load(1).step == 1
+
+
+# --- the paper's recipe ---
+
+PAPER = changed(
+    default_config("paper"),
+    {"epochs": 0, "steps": 60, "validate": 1000, "save": 1000, "cases": 0, "overfit": True,
+     "paper": {"size": [64, 48], "width": 0.25}, "optimiser": {"kind": "adamw", "rate": 0.0005},
+     "stream": {"batch": 2, "shard": 2, "pool": 4, "per_object": 2},
+     "machine": {"accelerator": "cpu", "workers": 0, "threads": 1}},
+    "the test",
+)  # fmt: skip
+
+
+def paper_trainer(out: Path, config: TrainConfig = PAPER) -> Trainer:
+    torch.manual_seed(0)
+    fabric = make_fabric(config)
+    return Trainer(config, make_task(config, Sources([bracket()], [], [], None)), fabric, out)
+
+
+def test_the_papers_recipe_overfits_a_batch(tmp_path: Path) -> None:
+    it = paper_trainer(tmp_path, changed(PAPER, {"stream": {"batch": 4, "pool": 8}}, "here"))
+    it.task.prepare(it._batches)
+    batch = next(it._batches(0))
+    values = [it.train_step(batch, 0.0) for _ in range(80)]
+    assert values[-1]["mv_loss"] < 0.7 * values[0]["mv_loss"]
+    assert min(v["sv_loss_1"] for v in values[-10:]) < 0.7 * values[0]["sv_loss_1"]
+    it.task.export(it.average.module, tmp_path, {})
+    networks = load_networks("paper", tmp_path)
+    assert networks.mvnet is not None and networks.size == (64, 48)
+
+
+def test_photographs_feed_the_papers_recipe(tmp_path: Path) -> None:
+    """A tiny data set in BOP layout, rendered on the spot; forward, backward and three inner iterations on it."""
+    folder = bop_folder(tmp_path / "set")
+    sources = Sources([], [], [(BopDataset(folder, "train", None), 1.0)], None)
+    config = changed(PAPER, {"sources": {"renders": 0.0}, "epochs": 2, "steps": 1}, "here")
+    torch.manual_seed(0)
+    task = make_task(config, sources)
+    assert isinstance(task, PaperTask) and task.catalogue.epoch == 4
+    it = Trainer(config, task, make_fabric(config), tmp_path / "run")
+    values = it.train_step(next(it._batches(0)), 0.0)
+    assert math.isfinite(values["loss"]) and "sv_loss_3" in values
+
+
+def bop_folder(root: Path, count: int = 4) -> Path:
+    """``count`` photographs of the bracket in train/000001."""
+    model, camera = bracket(), Camera.from_fov(0.6, 320, 240)
+    scene = root / "train" / "000001"
+    for folder in (scene / "rgb", scene / "mask_visib", root / "models"):
+        folder.mkdir(parents=True)
+    vertices = "\n".join(" ".join(f"{x:.4f}" for x in v) for v in model.vertices * 1000)
+    faces = "\n".join(f"3 {a} {b} {c}" for a, b, c in model.faces)
+    (root / "models" / "obj_000001.ply").write_text(
+        f"ply\nformat ascii 1.0\nelement vertex {len(model.vertices)}\nproperty float x\nproperty float y\n"
+        f"property float z\nelement face {len(model.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+        f"{vertices}\n{faces}\n"
+    )
+    rng = np.random.default_rng(0)
+    poses = [Pose(random_rotation(rng), np.array([0.0, 0.0, 0.5])) for _ in range(count)]
+    for k, view in enumerate(Renderer().render(model, poses, camera)):
+        assert view.mask is not None
+        cv2.imwrite(str(scene / "rgb" / f"{k:06d}.png"), view.image[..., ::-1])
+        cv2.imwrite(str(scene / "mask_visib" / f"{k:06d}_000000.png"), view.mask.astype(np.uint8) * 255)
+    truths = {str(k): [{"obj_id": 1, "cam_R_m2c": p.R.ravel().tolist(), "cam_t_m2c": (p.t * 1000).tolist()}]
+              for k, p in enumerate(poses)}  # fmt: skip
+    (scene / "scene_gt.json").write_text(json.dumps(truths))
+    (scene / "scene_camera.json").write_text(json.dumps({k: {"cam_K": camera.K.ravel().tolist()} for k in truths}))
+    return root
+
+
+# --- several processes ---
+
+
+def test_two_processes_train_as_one_with_twice_the_batch(tmp_path: Path) -> None:
+    """The paper's networks have no batch statistics: the same data give the same losses."""
+    config = changed(
+        PAPER,
+        {"overfit": False, "steps": 4, "save": 4, "optimiser": {"kind": "sgd"}, "stream": {"batch": 4, "pool": 8}},
+        "here",
+    )
+    two = changed(config, {"stream": {"batch": 2, "pool": 4}, "machine": {"devices": 2}}, "here")
+    out = tmp_path / "two"
+    process = start(two, out)
+    train_pose(config, tmp_path / "one")
+    assert process.wait(200) == 0
+    for name in ("branch.fc.weight", "heads.rotation.weight", "fc.weight"):
+        key = f"net.svnet.{name}"
+        a, b = final(tmp_path / "one", 4)[key], final(out, 4)[key]
+        assert torch.allclose(a, b, atol=2e-4), (key, (a - b).abs().max())
 
 
 # --- configuration ---

@@ -49,7 +49,7 @@ def pose(
         str | None,
         typer.Option(
             metavar="WEIGHTS|shipped|none",
-            help="Weights to start from; by default the shipped ones where --model or --meshes is given.",
+            help="Weights to start from; by default the shipped ones for given meshes, without --config.",
             rich_help_panel=SOURCES,
         ),
     ] = None,
@@ -131,6 +131,8 @@ def _config(file: Path | None, asked: dict[str, Any], objects: bool) -> TrainCon
         asked["sources"]["init"] = ""
     if asked["minutes"] is not None and asked["steps"] is None:
         asked["steps"] = 10**9  # the clock ends the training
+    if asked["steps"] is not None:
+        asked["epochs"] = 0
     return changed(config, _given(asked), "the command line")
 
 

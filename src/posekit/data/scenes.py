@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from posekit.camera import Box, Camera, mask_box
 from posekit.data.bop import BopDataset, Instance
 from posekit.data.pairs import random_light
-from posekit.geometry import Pose, cube_views, random_rotation
+from posekit.geometry import Pose, PoseNoise, cube_views, random_rotation
 from posekit.nets.pose_delta import PoseDelta, delta_between
 from posekit.object_model import ObjectModel
 from posekit.render import Renderer
@@ -147,6 +147,14 @@ def disturbed_box(box: Box, config: SceneConfig, rng: Rng) -> Box:
     half = 0.5 * size * np.exp(rng.normal(size=2) * config.box_scale)
     low, high = centre - half, centre + half
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+
+def disturbed_pose(T_cam_ctr: Pose, diameter: float, rng: Rng) -> Pose:
+    """DeepIM's disturbance; its centimetres, meant for objects of about 0.15 m at 0.9 m, keep their effect."""
+    R, t = PoseNoise().sample(rng)
+    moved = T_cam_ctr.t + t * np.array([diameter / 0.15, diameter / 0.15, T_cam_ctr.t[2] / 0.9])
+    moved[2] = max(moved[2], 1.2 * diameter)
+    return Pose(R @ T_cam_ctr.R, moved)
 
 
 def view_of(rgba: Image, camera: Camera) -> View:

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import copy
-import dataclasses
-from collections.abc import Callable, Iterator, Mapping
-from functools import cached_property
-from pathlib import Path
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
@@ -18,11 +14,10 @@ from posekit.nets.heads import PoseHeads
 from posekit.nets.inputs import images_to_tensor
 from posekit.nets.lite import LiteMVNet, LiteSVNet
 from posekit.nets.losses import DenseLossConfig, Target, dense_loss, first_pose_loss
-from posekit.nets.weights import Networks, save_networks
-from posekit.render import Renderer
+from posekit.nets.weights import Networks
 from posekit.train.config import TrainConfig
-from posekit.train.measure import Case, bop_cases, held_back_cases, measure
 from posekit.train.sources import Sources
+from posekit.train.task import PoseTask
 
 MEASURED = 20  # batches that the statistics are measured on
 
@@ -64,16 +59,11 @@ def target_of(batch: Batch) -> Target:
                   batch["lost"])  # fmt: skip
 
 
-class LiteTask:
-    """The recipe for the loop. fresh: the networks that have no measured statistics yet. MV-Net is trained where
-    the stream has samples for it."""
+class LiteTask(PoseTask):
+    """The recipe for the loop. MV-Net is trained where the stream has samples for it."""
 
     def __init__(self, config: TrainConfig, networks: Networks, sources: Sources, fresh: frozenset[str]) -> None:
-        self.config, self.networks, self.sources, self.fresh = config, networks, sources, fresh
-        nets: dict[str, nn.Module] = {"svnet": networks.svnet}
-        if config.stream.mvnet and networks.mvnet is not None:
-            nets["mvnet"] = networks.mvnet
-        self.nets = nn.ModuleDict(nets)
+        super().__init__(config, networks, sources, fresh, sources.models, with_mvnet=config.stream.mvnet > 0)
         self.module: nn.Module = LiteModule(self.nets, config.loss)
         self.module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
@@ -83,55 +73,13 @@ class LiteTask:
 
     def prepare(self, batches: Callable[[int], Iterator[Batch]]) -> None:
         """The paper's zero mean and unit variance, where the networks are new."""
-        fresh = self.fresh & set(self.nets)
-        if not fresh:
+        if not self.fresh:
             return
         stream = batches(0)
         found = [next(stream) for _ in range(MEASURED)]
-        if "svnet" in fresh:
+        if "svnet" in self.fresh:
             quat, v = (torch.cat([b[key][~b["lost"]] for b in found]) for key in ("quat_wxyz", "v"))
-            _heads(self.nets["svnet"]).set_statistics(quat, v)
-        if "mvnet" in fresh:
+            self.heads("svnet").set_statistics(quat, v)
+        if "mvnet" in self.fresh:
             quat, v = (torch.cat([b[key] for b in found]) for key in ("mv_quat_wxyz", "mv_v"))
-            _heads(self.nets["mvnet"]).set_statistics(quat, v)
-
-    def validate(self, nets: nn.Module) -> dict[str, float]:
-        return measure_task(self._with(copy.deepcopy(nets).cpu()), self.cases, self.bop, self.renderer)
-
-    def export(self, nets: nn.Module, out: Path, about: Mapping[str, Any]) -> None:
-        save_networks(out / "lite", self._with(nets), {**about, "trained_on": self.sources.about})
-
-    def _with(self, nets: nn.Module) -> Networks:
-        """The networks that ``nets`` holds."""
-        assert isinstance(nets, nn.ModuleDict)
-        mvnet = dict(nets).get("mvnet")
-        return dataclasses.replace(self.networks, svnet=nets["svnet"], mvnet=mvnet)  # type: ignore[arg-type]
-
-    @cached_property
-    def renderer(self) -> Renderer:
-        return Renderer()
-
-    @cached_property
-    def cases(self) -> list[Case]:
-        return held_back_cases(self.renderer, self.sources.models, self.sources.photos, self.config.stream.scenes,
-                               self.config.stream.augment, self.config.cases)  # fmt: skip
-
-    @cached_property
-    def bop(self) -> list[Case]:
-        held = self.sources.validation
-        return bop_cases(held, self.config.cases) if held is not None else []
-
-
-def measure_task(networks: Networks, cases: list[Case], bop: list[Case], renderer: Renderer) -> dict[str, float]:
-    """Measures of the held-back renderings and, as ``bop_*``, of a data set; the score is the data set's where there
-    is one."""
-    found = measure(cases, networks, renderer) if cases else {}
-    if bop:
-        found |= {f"bop_{k}": v for k, v in measure(bop, networks, renderer).items()}
-    return {"score": found.get("bop_add", found.get("add", 0.0)), **found}
-
-
-def _heads(module: nn.Module) -> PoseHeads:
-    heads = module.heads
-    assert isinstance(heads, PoseHeads)
-    return heads
+            self.heads("mvnet").set_statistics(quat, v)

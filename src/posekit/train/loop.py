@@ -10,6 +10,7 @@ killed ends as one that was not.
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -91,6 +92,7 @@ def make_fabric(config: TrainConfig) -> Any:
         from lightning_fabric.plugins.environments.torchelastic import TorchElasticEnvironment
     except ImportError as error:
         raise ConfigError("training needs Lightning Fabric: pip install 'posekit[train]'.") from error
+    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # it tells every run what was asked for
     machine = config.machine
     accelerator = machine.accelerator
     if accelerator == "auto":
@@ -182,7 +184,8 @@ class Trainer:
     def train_step(self, batch: Batch, done: float, also: Mapping[str, float] | None = None) -> dict[str, float]:
         """One optimiser step; returns the loss and its parts. also: further values to log."""
         rank, world = self.fabric.global_rank, self.fabric.world_size
-        seed = (self.config.seed * 1_000_003 + self.step) * world + rank
+        drawn = 0 if self.config.overfit else self.step
+        seed = (self.config.seed * 1_000_003 + drawn) * world + rank
         torch.manual_seed(seed)
         for group in self.raw.param_groups:
             group["lr"] = rate_at(self.step, done, self.config.optimiser)

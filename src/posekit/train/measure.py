@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from posekit.data.augment import AugmentConfig, observe
 from posekit.data.bop import BopDataset
 from posekit.data.procedural import random_object
-from posekit.data.scenes import SceneConfig, disturbed_box, render_scenes, usable_instances, view_of
-from posekit.geometry import Pose, PoseNoise
+from posekit.data.scenes import SceneConfig, disturbed_box, disturbed_pose, render_scenes, usable_instances, view_of
+from posekit.geometry import Pose
 from posekit.hypotheses import MVNetSearch
 from posekit.metrics import add, pose_error, within
 from posekit.nets.predictor import NetworkPredictor
@@ -78,13 +78,8 @@ def bop_cases(dataset: BopDataset, count: int) -> list[Case]:
 
 
 def _case(view: View, model: ObjectModel, truth: Pose, detection: Detection, rng: np.random.Generator) -> Case:
-    """Starts from DeepIM's disturbance, whose translation is scaled to the object's size and distance."""
-    centre = truth @ model.T_obj_ctr
-    R, t = PoseNoise().sample(rng)
-    t = t * np.array([model.diameter / 0.15, model.diameter / 0.15, centre.t[2] / 0.9])
-    moved = centre.t + t
-    moved[2] = max(moved[2], 1.2 * model.diameter)
-    start = Pose(R @ centre.R, moved) @ model.T_obj_ctr.inverse()
+    """Starts from DeepIM's disturbance."""
+    start = disturbed_pose(truth @ model.T_obj_ctr, model.diameter, rng) @ model.T_obj_ctr.inverse()
     return Case(view, model, truth, start, detection)
 
 
@@ -108,8 +103,9 @@ def _first_poses(cases: Sequence[Case], networks: Networks, renderer: Renderer) 
     searches: dict[int, MVNetSearch] = {}
     turns = []
     for case in cases:
-        search = searches.setdefault(id(case.model), MVNetSearch(case.model, networks, renderer))
-        found = search.search(case.view, case.detection, 1)
+        if id(case.model) not in searches:
+            searches[id(case.model)] = MVNetSearch(case.model, networks, renderer)
+        found = searches[id(case.model)].search(case.view, case.detection, 1)
         turn = pose_error(found[0].T_cam_obj, case.truth, case.model.symmetries.transforms())[0] if found else np.pi
         turns.append(float(np.rad2deg(turn)))
     return {"rotation_deg": float(np.median(turns)), "within_25deg": float(np.mean(np.array(turns) < 25))}

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 from pathlib import Path
 
+import numpy as np
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
 from posekit._version import __version__
+from posekit.data.procedural import random_object
+from posekit.data.scene_stream import Catalogue
 from posekit.errors import ConfigError, OutputError, WeightsError
 from posekit.files import write_text_atomic
 from posekit.nets.lite import LiteConfig, LiteMVNet, LiteSVNet
@@ -19,9 +23,11 @@ from posekit.nets.weights import Networks, build, load_networks
 from posekit.train.config import TrainConfig, read_config, write_config
 from posekit.train.lite import LiteTask
 from posekit.train.loop import Show, Task, Trainer, make_fabric
+from posekit.train.paper import PaperTask
 from posekit.train.sources import Sources, read_sources
 
 CONFIG = "config.toml"
+PROCEDURAL = 64  # objects of the paper recipe where no mesh is given
 
 
 def train_pose(config: TrainConfig, out: Path, show: Show | None = None, force: bool = False) -> list[dict[str, str]]:
@@ -53,22 +59,49 @@ def _train(config: TrainConfig, out: Path, show: Show | None) -> list[dict[str, 
         except OSError as error:
             raise OutputError(f"the folder {out} cannot be made: {error.strerror}.") from error
         write_text_atomic(out / CONFIG, write_config(config))
-    return Trainer(config, task, fabric, out, show).run()
+    return Trainer(_scheduled(config, task, fabric.world_size), task, fabric, out, show).run()
 
 
 def make_task(config: TrainConfig, sources: Sources) -> Task:
     """The recipe with its networks. Raises ConfigError, WeightsError."""
     networks, fresh = make_networks(config)
+    config = fitted(config, networks.size)
     if config.recipe == "paper":
-        raise ConfigError("the paper recipe is not built in.")
+        return PaperTask(config, networks, sources, fresh, catalogue_of(config, sources))
     if sources.bop:
         raise ConfigError("--bop feeds the paper recipe; the lite recipe trains on renderings: leave --bop out.")
-    if networks.size != config.stream.pairs.size or networks.size != config.stream.scenes.crop:
-        raise ConfigError(
-            f"the networks take crops of {networks.size}; stream.pairs.size is {config.stream.pairs.size} and "
-            f"stream.scenes.crop {config.stream.scenes.crop}: make them equal."
-        )
     return LiteTask(config, networks, sources, fresh)
+
+
+def fitted(config: TrainConfig, size: tuple[int, int]) -> TrainConfig:
+    """With a stream that makes crops of the networks' ``size``; what the augmentation has in pixels grows along."""
+    stream = config.stream
+    dilate = round(stream.augment.dilate * size[0] / stream.pairs.size[0])
+    stream = dataclasses.replace(
+        stream,
+        pairs=dataclasses.replace(stream.pairs, size=size),
+        scenes=dataclasses.replace(stream.scenes, crop=size),
+        augment=dataclasses.replace(stream.augment, dilate=dilate),
+    )
+    return dataclasses.replace(config, stream=stream)
+
+
+def catalogue_of(config: TrainConfig, sources: Sources) -> Catalogue:
+    """The paper recipe's objects: the meshes given, or as many procedural ones where there is nothing else."""
+    models = sources.models
+    if not models and not sources.bop:
+        models = [random_object(np.random.default_rng([config.seed, k]), sources.photos) for k in range(PROCEDURAL)]
+    return Catalogue(models, sources.bop, config.sources.renders, config.stream.scenes)
+
+
+def _scheduled(config: TrainConfig, task: Task, world: int) -> TrainConfig:
+    """With the steps that its epochs make, where it counts in epochs."""
+    if not config.epochs:
+        return config
+    if not isinstance(task, PaperTask):
+        raise ConfigError("epochs need a set of samples: the lite recipe draws without end. Give --steps or --minutes.")
+    steps = math.ceil(config.epochs * task.catalogue.epoch / (config.stream.batch * world))
+    return dataclasses.replace(config, steps=max(1, steps))
 
 
 def make_networks(config: TrainConfig) -> tuple[Networks, frozenset[str]]:
