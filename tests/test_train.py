@@ -19,9 +19,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from typer.testing import CliRunner
 
 from objects import bracket
 from posekit.camera import Camera
+from posekit.cli.app import app
 from posekit.data.bop import BopDataset
 from posekit.data.stream import PairStream, StreamConfig
 from posekit.errors import ConfigError, OutputError, TrainingError, WeightsError
@@ -351,3 +353,22 @@ def test_a_wrong_configuration_is_refused(tmp_path: Path, text: str, message: st
 def test_options_override_a_configuration() -> None:
     config = changed(default_config("lite"), {"stream": {"batch": 16}, "minutes": 3}, "here")
     assert config.stream.batch == 16 and config.minutes == 3.0 and config.stream.mvnet == 8
+
+
+# --- the command line ---
+
+
+def test_the_command_trains_for_a_mesh_and_reports(tmp_path: Path) -> None:
+    mesh = bop_folder(tmp_path / "set") / "models" / "obj_000001.ply"
+    file = tmp_path / "a.toml"
+    file.write_text(write_config(dataclasses.replace(CONFIG, steps=1)))
+    out = tmp_path / "mine"
+    arguments = ["train", "pose", "--config", str(file), "--model", str(mesh), "--units", "mm", "--out", str(out)]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    assert "held-back renderings: rotation" in result.output and "MV-Net's first poses" in result.output
+    assert load_networks("lite", out).about["trained_on"] == "renderings of obj_000001"
+    again = CliRunner().invoke(app, ["train", "pose", "--out", str(out)])
+    assert again.exit_code == 1 and "--resume" in again.output
+    wrong = CliRunner().invoke(app, ["train", "pose", "--bop", str(tmp_path), "--out", str(tmp_path / "other")])
+    assert wrong.exit_code == 1
