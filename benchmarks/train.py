@@ -1,6 +1,6 @@
 """How fast the lite recipe trains, and where the time goes.
 
-    python benchmarks/train.py [--steps 20] [--batch 32] [--threads 2] [--workers 1]
+    python benchmarks/train.py [--steps 60] [--batch 32] [--threads 2] [--workers 1]
 
 Prints samples a second, the share of the CPU time that rendering and augmentation take, and the training's multiply-
 adds a second beside the machine's float32 matrix-multiply rate, both measured in the same run: absolute figures of a
@@ -24,7 +24,7 @@ from posekit.train.loop import Trainer, loader, make_fabric
 from posekit.train.pose import make_task
 from posekit.train.sources import Sources
 
-WARM = 3  # steps before the clock starts
+WARM = 3  # steps before the clock starts; many more must be timed than the loader keeps ready
 
 
 def matmul_rate(seconds: float = 2.0, size: int = 2048) -> float:
@@ -51,7 +51,7 @@ def children() -> list[int]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=int, default=20)
+    parser.add_argument("--steps", type=int, default=60)
     parser.add_argument("--batch", type=int, default=32)
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--workers", type=int, default=1)
