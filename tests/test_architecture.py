@@ -32,6 +32,7 @@ DOORS = {
     "glcontext": {"render"},
     "trimesh": {"object_model"},
     "torchvision": {"detect", "train"},
+    "lightning_fabric": {"train"},
     "typer": {"cli"},
     "rich": {"cli"},
 }

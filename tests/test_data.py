@@ -13,9 +13,12 @@ from objects import bracket
 from posekit.data.augment import AugmentConfig, augment, disturb_mask
 from posekit.data.pairs import Pair, PairConfig, render_pairs, stack_statistics
 from posekit.data.procedural import random_object, random_texture
+from posekit.data.scenes import Frontal, SceneConfig, box_sample, render_scenes
 from posekit.data.stream import PairStream, StreamConfig, load_photos
 from posekit.geometry import quat_to_rotation, rotation_angle
+from posekit.nets.pose_delta import apply_delta
 from posekit.render import Light, Renderer
+from posekit.zoom import frontal_pose
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +104,7 @@ def test_procedural_objects_are_valid_and_various() -> None:
 
 
 def small(**changes: int) -> StreamConfig:
-    return StreamConfig(**{"batch": 4, "pool": 32, "per_object": 4, "objects": 4, **changes})
+    return StreamConfig(**{"batch": 4, "pool": 32, "per_object": 4, **changes})
 
 
 def test_a_seed_gives_the_same_batches() -> None:
@@ -127,3 +130,39 @@ def test_photos_are_read_and_others_left(tmp_path: Path) -> None:
     photos = load_photos(tmp_path)
     assert [p.shape for p in photos] == [(400, 800, 3)] and tuple(photos[0][0, 0]) == (0, 0, 255)
     assert load_photos(None) == []
+
+
+def test_a_stream_goes_on_where_it_stopped() -> None:
+    config = small(mvnet=2, reuse=1)
+    whole = iter(PairStream(config, 1))
+    batches = [next(whole) for _ in range(9)]
+    later = iter(PairStream(config, 1, start=7))
+    for batch in batches[7:]:
+        again = next(later)
+        assert set(batch) == set(again) and all(torch.equal(batch[k], again[k]) for k in batch)
+    assert not torch.equal(batches[7]["observed"], batches[8]["observed"])
+
+
+def test_two_processes_see_what_one_with_twice_the_batch_sees() -> None:
+    both = next(iter(PairStream(small(batch=4, shard=2, pool=16), 1)))
+    parts = [next(iter(PairStream(small(batch=2, shard=2, pool=8), 1, rank=rank))) for rank in range(2)]
+    for key, value in both.items():
+        assert torch.equal(value, torch.cat([part[key] for part in parts])), key
+
+
+def test_the_numbers_of_mvnets_samples_are_true() -> None:
+    """The frontal view moved by a sample's delta looks as the sample's crop does."""
+    renderer, model, config = Renderer(), bracket((0.02, 0.0, 0.01)), SceneConfig()
+    frontal = Frontal.of(model, renderer, config.crop)
+    rng = np.random.default_rng(3)
+    assert frontal.views.shape == (6, 120, 160, 4)
+    for scene in render_scenes(renderer, model, 6, config, rng):
+        sample = box_sample(scene.rgba, scene, frontal, config, rng)
+        source = frontal_pose(frontal.camera, frontal.distance, sample.camera)
+        pose = apply_delta(source, sample.delta, sample.camera.fx) @ model.T_obj_ctr.inverse()
+        (drawn,) = renderer.render(model, [pose], sample.camera, coords=False)
+        seen = sample.observed[..., 3] > 0
+        assert drawn.mask is not None
+        assert (drawn.mask & seen).sum() / (drawn.mask | seen).sum() > 0.93
+        rows, columns = np.flatnonzero(seen.any(1)), np.flatnonzero(seen.any(0))
+        assert 0.5 < max((columns[-1] - columns[0]) / 160, (rows[-1] - rows[0]) / 120) <= 1.0, "the box fills the crop"

@@ -9,7 +9,8 @@ PosekitError
 │   └── ConfigError   a TOML file or a combination of options
 ├── OutputError       a folder or file that cannot be written, or would be overwritten
 ├── WeightsError      weights that are missing, damaged or of another preset
-└── RenderError       no usable OpenGL, or a rendering that failed
+├── RenderError       no usable OpenGL, or a rendering that failed
+└── TrainingError     a training that cannot go on
 """
 
 
@@ -50,4 +51,8 @@ class WeightsError(PosekitError):
 
 
 class RenderError(PosekitError):
+    pass
+
+
+class TrainingError(PosekitError):
     pass

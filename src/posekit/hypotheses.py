@@ -35,7 +35,7 @@ from posekit.object_model import ObjectModel
 from posekit.render import Light, Renderer
 from posekit.results import Detection
 from posekit.view import View
-from posekit.zoom import zoom_to_box, zoom_to_pose
+from posekit.zoom import frontal_camera, frontal_pose, zoom_to_box, zoom_to_pose
 
 Array = NDArray[np.float64]
 FArray = NDArray[np.float32]
@@ -216,18 +216,7 @@ class MVNetSearch:
 
     def frontal(self, crop_camera: Camera) -> Pose:
         """The ``T_view_ctr`` to which MV-Net's answer is relative."""
-        return Pose(self.rotations[0], np.array([0, 0, self.distance * crop_camera.fx / self.camera.fx]))
-
-
-def frontal_camera(model: ObjectModel, size: tuple[int, int]) -> tuple[Camera, float]:
-    """The camera of MV-Net's views and the object's distance: a crop 4:3 round the frontal view's box.
-
-    size: (width, height) in pixels.
-    """
-    distance = 5.0 * model.diameter
-    frontal = Pose(cube_views()[0], np.array([0, 0, distance]))
-    whole = Camera.from_fov(1.0, *size)
-    return zoom_to_pose(whole, frontal, model.outline - model.center, size, enlarge=1.0).camera, distance
+        return frontal_pose(self.camera, self.distance, crop_camera)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from posekit.camera import Box, Camera, Zoom
-from posekit.geometry import Pose, rotation_between
+from posekit.geometry import Pose, cube_views, rotation_between
+from posekit.object_model import ObjectModel
 
 Array = NDArray[np.float64]
 
@@ -43,6 +44,23 @@ def zoom_to_box(camera: Camera, box: Box, size: tuple[int, int], *, enlarge: flo
     """The window centred on a box (edges), expanded to the crop's aspect ratio (paper, section 3.1)."""
     ray = camera.box_centre_ray(box)
     return Zoom.look_at(camera, ray, enlarge * _half_width(ray, camera.box_corner_rays(box), size), size)
+
+
+def frontal_camera(model: ObjectModel, size: tuple[int, int]) -> tuple[Camera, float]:
+    """The camera of MV-Net's views and the object's distance: a crop 4:3 round the frontal view's box.
+
+    size: (width, height) in pixels.
+    """
+    distance = 5.0 * model.diameter
+    frontal = Pose(cube_views()[0], np.array([0, 0, distance]))
+    whole = Camera.from_fov(1.0, *size)
+    return zoom_to_pose(whole, frontal, model.outline - model.center, size, enlarge=1.0).camera, distance
+
+
+def frontal_pose(camera: Camera, distance: float, crop_camera: Camera) -> Pose:
+    """The ``T_view_ctr`` to which MV-Net's answer is relative: the frontal view in the middle of a crop, at the depth
+    at which it looks as large there as in ``camera`` at ``distance`` (both from `frontal_camera`)."""
+    return Pose(cube_views()[0], np.array([0, 0, distance * crop_camera.fx / camera.fx]))
 
 
 def _half_width(ray: Array, points: Array, size: tuple[int, int]) -> float:

@@ -50,19 +50,33 @@ class Sample:
 def augment(pair: Pair, others: Sequence[Pair], photos: Sequence[Image], config: AugmentConfig, rng: Rng) -> Sample:
     """Put the target before a background and behind occluders, photograph it badly, and blur what is known of
     its mask. others: pairs to take clutter and occluders from."""
-    H, W = pair.target.shape[:2]
+    observed, hidden = observe(pair.target, [other.target for other in others], photos, config, rng)
+    visible = pair.seen & ~_at_anchors(hidden, pair)
+    return Sample(observed, pair.source, pair, visible)
+
+
+def observe(
+    target: Image, others: Sequence[Image], photos: Sequence[Image], config: AugmentConfig, rng: Rng
+) -> tuple[Image, NDArray[np.bool_]]:
+    """A rendered object, uint8 (H, W, 4) with its mask in alpha, as a bad photograph with a bad mask (H, W, 4), and
+    what hides it, bool (H, W). others: renderings of the same size to take clutter and occluders from."""
+    H, W = target.shape[:2]
     scene = _background((W, H), others, photos, config, rng)
-    alpha = pair.target[..., 3] > 0
-    scene[alpha] = _recolour(pair.target[..., :3], rng)[alpha]
+    alpha = target[..., 3] > 0
+    scene[alpha] = _recolour(target[..., :3], rng)[alpha]
     hidden = np.zeros((H, W), bool)
     if len(others) and rng.random() < config.occluded:
         for _ in range(int(rng.integers(1, 3))):
             _paste_occluder(scene, hidden, alpha, others[int(rng.integers(len(others)))], rng)
-    visible_mask = alpha & ~hidden
     observed = _photograph(scene, config, rng)
-    mask = disturb_mask(visible_mask, config, rng)
-    visible = pair.seen & ~_at_anchors(hidden, pair)
-    return Sample(np.dstack([observed, mask.astype(np.uint8) * 255]), pair.source, pair, visible)
+    mask = disturb_mask(alpha & ~hidden, config, rng)
+    return np.dstack([observed, mask.astype(np.uint8) * 255]), hidden
+
+
+def observe_photo(photo: Image, config: AugmentConfig, rng: Rng) -> Image:
+    """A real photograph and its visible mask (H, W, 4), photographed once more and its mask disturbed."""
+    mask = disturb_mask(photo[..., 3] > 0, config, rng)
+    return np.dstack([_photograph(photo[..., :3], config, rng), mask.astype(np.uint8) * 255])
 
 
 def _at_anchors(hidden: NDArray[np.bool_], pair: Pair) -> NDArray[np.bool_]:
@@ -74,7 +88,7 @@ def _at_anchors(hidden: NDArray[np.bool_], pair: Pair) -> NDArray[np.bool_]:
     return hidden[place[..., 1].clip(0, H - 1), place[..., 0].clip(0, W - 1)]
 
 
-def _background(size: tuple[int, int], others: Sequence[Pair], photos: Sequence[Image], config: AugmentConfig,
+def _background(size: tuple[int, int], others: Sequence[Image], photos: Sequence[Image], config: AugmentConfig,
                 rng: Rng) -> Image:  # fmt: skip
     W, H = size
     if len(photos) and rng.random() < config.photo:
@@ -87,7 +101,7 @@ def _background(size: tuple[int, int], others: Sequence[Pair], photos: Sequence[
         scene = np.broadcast_to(random_colour(rng).astype(np.uint8), (H, W, 3)).copy()
     if len(others):
         for _ in range(int(rng.integers(0, config.clutter + 1))):
-            other = others[int(rng.integers(len(others)))].target
+            other = others[int(rng.integers(len(others)))]
             M = _placement(rng, W, H, rng.uniform(0.3, 1.3))
             pasted = cv2.warpAffine(other, M, size, flags=cv2.INTER_LINEAR)
             on = pasted[..., 3] > 127
@@ -102,11 +116,11 @@ def _placement(rng: Rng, W: int, H: int, scale: float) -> NDArray[np.float64]:
     return M
 
 
-def _paste_occluder(scene: Image, hidden: NDArray[np.bool_], alpha: NDArray[np.bool_], other: Pair, rng: Rng) -> None:
+def _paste_occluder(scene: Image, hidden: NDArray[np.bool_], alpha: NDArray[np.bool_], other: Image, rng: Rng) -> None:
     """Something before the object, hiding at most 60 % of it; drawn in place."""
     H, W = hidden.shape
     M = _placement(rng, W, H, rng.uniform(0.3, 1.0))
-    pasted = cv2.warpAffine(other.target, M, (W, H), flags=cv2.INTER_LINEAR)
+    pasted = cv2.warpAffine(other, M, (W, H), flags=cv2.INTER_LINEAR)
     on = pasted[..., 3] > 127
     if (alpha & (on | hidden)).sum() > 0.6 * alpha.sum():
         return

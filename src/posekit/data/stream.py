@@ -1,11 +1,21 @@
-"""An endless stream of training batches, rendered and augmented in worker processes. Layer 3."""
+"""Endless streams of training batches, rendered and augmented in worker processes. Layer 3.
+
+Batch k is a pure function of the seed, k, the number of workers and the shards that a process draws: a training that
+was killed goes on with the batch it would have had next. What makes it so: every random number comes from a generator
+seeded for one purpose, and a pool of renderings is a window of numbered blocks, each of which can be made again.
+A batch consists of shards with pools of their own; processes divide the shards among them, so that two processes see
+together what one with twice the batch sees.
+"""
 
 from __future__ import annotations
 
+import itertools
+import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Generic, TypeVar
 
 import cv2
 import numpy as np
@@ -14,26 +24,53 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
-from posekit.data.augment import AugmentConfig, Sample, augment
+from posekit.data.augment import AugmentConfig, Sample, augment, observe
 from posekit.data.pairs import Pair, PairConfig, render_pairs
 from posekit.data.procedural import random_object
+from posekit.data.scenes import BoxSample, Frontal, Scene, SceneConfig, box_sample, render_scenes
+from posekit.errors import ConfigError
+from posekit.geometry import Pose
 from posekit.object_model import ObjectModel
+from posekit.render import Renderer
 
 Image = NDArray[np.uint8]
+Batch = dict[str, Tensor]
+T = TypeVar("T")
+
+# What a generator is for, the second number of its seed
+OBJECTS, PAIRS, SCENES, BATCHES = range(4)
 
 
 @dataclass(frozen=True)
 class StreamConfig:
-    """batch: samples. pool: pairs that a worker keeps. reuse: how often a pair is used, with fresh augmentation.
-    per_object: pairs rendered of one object at a time. objects: how many random objects a worker keeps at once."""
+    """batch: pairs in a process's batch. shard: pairs drawn from one pool at most; the greatest common divisor with
+    the batch counts. pool: pairs kept for a batch, over all its shards. reuse: how often a pair is used, with fresh
+    augmentation. per_object: pairs rendered of one object at a time. serves: how often an object is rendered.
+    mvnet: MV-Net's samples in a batch, a multiple of the number of shards; 0 = none. share: share of the user's
+    meshes where procedural ones are wanted too."""
 
     batch: int = 32
+    shard: int = 8
     pool: int = 1024
     reuse: int = 3
     per_object: int = 8
-    objects: int = 64
+    serves: int = 3
+    mvnet: int = 0
+    share: float = 1.0
     pairs: PairConfig = PairConfig()
+    scenes: SceneConfig = SceneConfig()
     augment: AugmentConfig = AugmentConfig()
+
+    def __post_init__(self) -> None:
+        if min(self.batch, self.shard, self.pool, self.reuse, self.per_object, self.serves) < 1:
+            raise ConfigError("a stream's batch, shard, pool, reuse, per_object and serves are at least 1.")
+        if self.mvnet % self.shards:
+            raise ConfigError(f"mvnet is {self.mvnet}; it must be a multiple of the batch's {self.shards} shards.")
+
+    @property
+    def shards(self) -> int:
+        """Pools that a batch is drawn from."""
+        return self.batch // math.gcd(self.batch, self.shard)
 
 
 def load_photos(folder: Path | None, longest: int = 800) -> list[Image]:
@@ -54,59 +91,130 @@ def load_photos(folder: Path | None, longest: int = 800) -> list[Image]:
     return photos
 
 
-class PairStream(IterableDataset[dict[str, Tensor]]):
-    """Batches as dictionaries of tensors. Deterministic for a seed, a start and a number of workers.
+class Window(Generic[T]):
+    """The newest blocks of an endless row, each made by its number. As batches go by the window moves on."""
 
-    models: the objects to train on; none = procedural ones, always new. share: the share of pairs that show
-    ``models`` where both are wanted.
+    def __init__(self, make: Callable[[int], T], first: int, most: int, per_batch: float) -> None:
+        self.make, self.first, self.most, self.per_batch = make, first, most, per_batch
+        self.blocks: dict[int, T] = {}
+
+    def at(self, batch: int) -> list[T]:
+        """The blocks that batch number ``batch`` is drawn from; only those that are not at hand are made."""
+        end = self.first + int(batch * self.per_batch)
+        wanted = range(max(0, end - self.most), end)
+        self.blocks = {k: self.blocks[k] if k in self.blocks else self.make(k) for k in wanted}
+        return list(self.blocks.values())
+
+
+def window(make: Callable[[int], T], config: StreamConfig, drawn: int) -> Window[T]:
+    """A pool for a shard from which ``drawn`` samples a batch are drawn."""
+    most = max(1, config.pool // config.shards // config.per_object)
+    return Window(make, max(1, most // 4), most, drawn / config.reuse / config.per_object)
+
+
+class Source:
+    """The objects of one lane and shard: the user's meshes, or procedural ones, always new."""
+
+    def __init__(self, stream: PairStream, lane: int, shard: int) -> None:
+        self.stream, self.lane, self.shard = stream, lane, shard
+        self._last: tuple[tuple[int, int], ObjectModel] | None = None
+
+    def rng(self, purpose: int, k: int) -> np.random.Generator:
+        return np.random.default_rng([self.stream.seed, purpose, self.lane, self.shard, k])
+
+    def object(self, purpose: int, block: int) -> ObjectModel:
+        """What block number ``block`` shows; the last one is kept, because the next block often shows it too."""
+        key = (purpose, block // self.stream.config.serves)
+        if self._last is None or self._last[0] != key:
+            self._last = (
+                key,
+                self._make(np.random.default_rng([self.stream.seed, OBJECTS, self.lane, self.shard, *key])),
+            )
+        return self._last[1]
+
+    def _make(self, rng: np.random.Generator) -> ObjectModel:
+        models = self.stream.models
+        if len(models) and rng.random() < self.stream.config.share:
+            return models[int(rng.integers(len(models)))]
+        return random_object(rng, self.stream.photos)
+
+
+class _Shard:
+    """What one lane draws a shard of each of its batches from."""
+
+    def __init__(self, stream: PairStream, lane: int, shard: int, renderer: Renderer) -> None:
+        self.stream, self.config, self.shard, self.renderer = stream, stream.config, shard, renderer
+        self.for_pairs, self.for_scenes = Source(stream, lane, shard), Source(stream, lane, shard)
+        self.pairs = window(self._pairs, self.config, self.config.batch // self.config.shards)
+        self.scenes = window(self._scenes, self.config, self.config.mvnet // self.config.shards)
+
+    def _pairs(self, block: int) -> list[Pair]:
+        model, rng = self.for_pairs.object(PAIRS, block), self.for_pairs.rng(PAIRS, block)
+        return render_pairs(self.renderer, model, self.config.per_object, self.config.pairs, rng)
+
+    def _scenes(self, block: int) -> tuple[Frontal, list[Scene]]:
+        model, rng = self.for_scenes.object(SCENES, block), self.for_scenes.rng(SCENES, block)
+        frontal = Frontal.of(model, self.renderer, self.config.scenes.crop)
+        return frontal, render_scenes(self.renderer, model, self.config.per_object, self.config.scenes, rng)
+
+    def draw(self, k: int, lanes: int) -> tuple[list[Sample], Frontal | None, list[BoxSample]]:
+        """This shard of batch k: pairs for SV-Net, and samples of one object for MV-Net."""
+        config, photos = self.config, self.stream.photos
+        rng = np.random.default_rng([self.stream.seed, BATCHES, k, self.shard])
+        pool = [pair for block in self.pairs.at(k // lanes) for pair in block]
+        chosen = rng.integers(len(pool), size=config.batch // config.shards)
+        samples = [augment(pool[i], pool, photos, config.augment, rng) for i in chosen]
+        if not config.mvnet:
+            return samples, None, []
+        blocks = [block for block in self.scenes.at(k // lanes) if block[1]]
+        if not blocks:
+            raise ConfigError("none of the objects is seen in its own training scenes: are the meshes empty?")
+        frontal, scenes = blocks[int(rng.integers(len(blocks)))]
+        others = [scene.rgba for block in blocks for scene in block[1]]
+        boxed = []
+        for i in rng.integers(len(scenes), size=config.mvnet // config.shards):
+            picture, _ = observe(scenes[i].rgba, others, photos, config.augment, rng)
+            boxed.append(box_sample(picture, scenes[i], frontal, config.scenes, rng))
+        return samples, frontal, boxed
+
+
+class PairStream(IterableDataset[Batch]):
+    """Batches for the lite recipe, as dictionaries of tensors: `collate`'s, and with ``mvnet`` `collate_boxes`'.
+
+    models: the objects to train on; none = procedural ones. start: the first batch's number. rank: the process's
+    number, which says which shards it draws.
     """
 
     def __init__(self, config: StreamConfig, seed: int, photos: Sequence[Image] = (),
-                 models: Sequence[ObjectModel] = (), share: float = 1.0) -> None:  # fmt: skip
-        self.config, self.seed, self.photos = config, seed, photos
-        self.models, self.share = models, share
+                 models: Sequence[ObjectModel] = (), *, start: int = 0, rank: int = 0) -> None:  # fmt: skip
+        self.config, self.seed, self.photos, self.models = config, seed, photos, models
+        self.start, self.rank = start, rank
 
-    def __iter__(self) -> Iterator[dict[str, Tensor]]:
-        from posekit.render import Renderer
-
-        info = get_worker_info()
-        rng = np.random.default_rng([self.seed, 0 if info is None else info.id])
-        if info is not None:  # a worker shares the machine with the training
-            os.environ.setdefault("LP_NUM_THREADS", "0")
-            cv2.setNumThreads(0)
-            torch.set_num_threads(1)
-        renderer = Renderer()
-        config = self.config
-        pool: list[Pair] = []
-        shapes: list[ObjectModel] = []
-        fresh_per_batch = config.batch / config.reuse
-        due = float(config.pool) / 4
-        while True:
-            while due >= config.per_object:
-                pool.extend(render_pairs(renderer, self._object(shapes, rng), config.per_object, config.pairs, rng))
-                due -= config.per_object
-            while len(pool) > config.pool:  # a random old pair makes room
-                k = int(rng.integers(len(pool) - config.per_object))
-                pool[k] = pool[-1]
-                pool.pop()
-            chosen = rng.integers(len(pool), size=config.batch)
-            yield collate([augment(pool[k], pool, self.photos, config.augment, rng) for k in chosen])
-            due += fresh_per_batch
-
-    def _object(self, shapes: list[ObjectModel], rng: np.random.Generator) -> ObjectModel:
-        """The next object: one of the given models or a procedural one, each of which serves a few times."""
-        if len(self.models) and rng.random() < self.share:
-            return self.models[int(rng.integers(len(self.models)))]
-        if len(shapes) < self.config.objects:
-            shapes.append(random_object(rng, self.photos))
-            return shapes[-1]
-        k = int(rng.integers(len(shapes)))
-        if rng.random() < 0.3:
-            shapes[k] = random_object(rng, self.photos)
-        return shapes[k]
+    def __iter__(self) -> Iterator[Batch]:
+        first, lanes = worker_lane(self.start)
+        renderer, count = Renderer(), self.config.shards
+        shards = [_Shard(self, first % lanes, self.rank * count + i, renderer) for i in range(count)]
+        for k in itertools.count(first, lanes):
+            drawn = [shard.draw(k, lanes) for shard in shards]
+            batch = collate([sample for samples, _, _ in drawn for sample in samples])
+            if self.config.mvnet:
+                batch |= collate_boxes([(frontal, boxed) for _, frontal, boxed in drawn if frontal is not None])
+            yield batch
 
 
-def collate(samples: Sequence[Sample]) -> dict[str, Tensor]:
+def worker_lane(start: int) -> tuple[int, int]:
+    """The first batch of this worker process, and how many workers there are. A batch's number and theirs say which
+    lane of data it comes from, whichever worker makes it."""
+    info = get_worker_info()
+    if info is None:
+        return start, 1
+    os.environ.setdefault("LP_NUM_THREADS", "0")  # a worker shares the machine with the training
+    cv2.setNumThreads(0)
+    torch.set_num_threads(1)
+    return start + info.id, info.num_workers
+
+
+def collate(samples: Sequence[Sample]) -> Batch:
     """observed, rendered: uint8 (B, H, W, 4); flow (B, 2, h, w); valid, visible (B, h, w); the rest (B, ...)."""
     pairs = [s.pair for s in samples]
 
@@ -123,4 +231,18 @@ def collate(samples: Sequence[Sample]) -> dict[str, Tensor]:
         "v": stack([p.v for p in pairs]),
         "angle": torch.tensor([p.angle for p in pairs], dtype=torch.float32),
         "lost": torch.tensor([p.lost for p in pairs]),
+    }
+
+
+def collate_boxes(groups: Sequence[tuple[Frontal, Sequence[BoxSample]]]) -> Batch:
+    """MV-Net's samples by object: mv_observed uint8 (B, H, W, 4); mv_views uint8 (n, 6, H, W, 4), the n objects;
+    mv_object (B,), which of them; mv_quat_wxyz (B, 4), mv_v (B, 3)."""
+    boxed = [sample for _, samples in groups for sample in samples]
+    quat = np.stack([Pose.rotation(s.delta.R).quat_wxyz for s in boxed])
+    return {
+        "mv_observed": torch.from_numpy(np.stack([s.observed for s in boxed])),
+        "mv_views": torch.from_numpy(np.stack([frontal.views for frontal, _ in groups])),
+        "mv_object": torch.tensor([n for n, (_, samples) in enumerate(groups) for _ in samples]),
+        "mv_quat_wxyz": torch.from_numpy(quat.astype(np.float32)),
+        "mv_v": torch.from_numpy(np.stack([s.delta.v for s in boxed]).astype(np.float32)),
     }

@@ -38,7 +38,8 @@ def svnet_loss(prediction: Prediction, heads: PoseHeads, quat_wxyz: Tensor, v: T
 
 @dataclass(frozen=True)
 class DenseLossConfig:
-    """Weights of the lite preset's losses. hidden: weight of anchors that the observed picture does not show."""
+    """Weights of the lite preset's losses. hidden: weight of anchors that the observed picture does not show.
+    mvnet: of `first_pose_loss` beside all others."""
 
     gamma: float = 0.8
     hidden: float = 0.3
@@ -49,6 +50,7 @@ class DenseLossConfig:
     rotation: float = 1.0
     translation: float = 1.0
     angle: float = 1.0
+    mvnet: float = 1.0
     max_flow_px: float = 80.0
 
 
@@ -76,7 +78,7 @@ def dense_loss(
     cells = F.avg_pool2d(weight[:, None], 2)
     flow_cells = F.avg_pool2d(target.flow.nan_to_num() * weight[:, None], 2) / cells.clamp_min(1e-6)
     total_cells = cells.sum().clamp_min(1.0)
-    sequence = torch.zeros(())
+    sequence = total_cells.new_zeros(())
     for k, flow in enumerate(flows):
         error = (flow - flow_cells).abs().sum(1, keepdim=True)
         sequence = sequence + config.gamma ** (len(flows) - 1 - k) * (error * cells).sum() / total_cells
@@ -113,6 +115,21 @@ def dense_loss(
     return loss, {name: float(value.detach()) for name, value in parts.items()}
 
 
+def first_pose_loss(
+    prediction: Prediction, heads: PoseHeads, quat_wxyz: Tensor, v: Tensor
+) -> tuple[Tensor, dict[str, float]]:
+    """MV-Net lite's loss: the distance to the nearer of q and -q, which are one rotation, and the translation's in
+    normalised units. Unlike equation 1 it does not jump at half a turn. quat_wxyz: (B, 4); v: (B, 3)."""
+    near = (prediction.quat_wxyz - quat_wxyz).abs().sum(1)
+    far = (prediction.quat_wxyz + quat_wxyz).abs().sum(1)
+    rotation = torch.minimum(near, far).mean()
+    translation = ((prediction.v - v) / heads.v_std).abs().mean()
+    cosine = (F.normalize(prediction.quat_wxyz.detach()) * quat_wxyz).sum(1).abs().clamp(max=1.0)
+    angle_deg = torch.rad2deg(2 * torch.acos(cosine)).mean()
+    parts = {"mv_rotation": rotation, "mv_translation": translation, "mv_angle_deg": angle_deg}
+    return rotation + translation, {name: float(value.detach()) for name, value in parts.items()}
+
+
 def matching_loss(likeness: Tensor, flow: Tensor, shown: Tensor) -> Tensor:
     """Cross-entropy of the cell that each shown rendered cell lies on in the observed crop.
 
@@ -121,7 +138,7 @@ def matching_loss(likeness: Tensor, flow: Tensor, shown: Tensor) -> Tensor:
     through the recurrent updates, several times more slowly (docs/log.md).
     """
     B, _, h, w = flow.shape
-    ys, xs = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
+    ys, xs = torch.meshgrid(*(torch.arange(n, device=flow.device) for n in (h, w)), indexing="ij")
     x, y = xs + flow[:, 0] / CELL, ys + flow[:, 1] / CELL
     inside = shown & (x >= 0) & (x <= w - 1) & (y >= 0) & (y <= h - 1)
     x, y = x.clamp(0, w - 1.001), y.clamp(0, h - 1.001)
@@ -129,7 +146,7 @@ def matching_loss(likeness: Tensor, flow: Tensor, shown: Tensor) -> Tensor:
     fx, fy = x - x0, y - y0
     first = (y0 * w + x0).long()
     logits = torch.log_softmax(likeness, dim=2).view(B, h, w, h * w)
-    total = torch.zeros(())
+    total = logits.new_zeros(())
     for dy, dx, share in ((0, 0, (1 - fx) * (1 - fy)), (0, 1, fx * (1 - fy)), (1, 0, (1 - fx) * fy), (1, 1, fx * fy)):
         found = logits.gather(3, (first + dy * w + dx).unsqueeze(3)).squeeze(3)
         total = total - (found * share * inside).sum()

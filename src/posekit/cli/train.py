@@ -1,0 +1,188 @@
+"""``posekit train``: networks from meshes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from posekit.cli.options import ForceOption, Units
+
+if TYPE_CHECKING:
+    from posekit.train.config import TrainConfig
+    from posekit.train.loop import Show
+
+SOURCES, SCHEDULE, MACHINE = "Sources", "Schedule", "Machine"
+
+train = typer.Typer(no_args_is_help=True, help="Train networks from meshes.")
+
+
+@train.callback()
+def _train() -> None:
+    """Train networks from meshes."""
+
+
+@train.command("pose")
+def pose(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the weights, curves and checkpoints.")],
+    model: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--model", "-m", metavar="MESH", help="An object to train for; repeat it.", rich_help_panel=SOURCES
+        ),
+    ] = None,
+    meshes: Annotated[
+        list[Path] | None, typer.Option(metavar="DIR", help="A folder of meshes.", rich_help_panel=SOURCES)
+    ] = None,
+    units: Annotated[Units, typer.Option(help="Of the meshes.", rich_help_panel=SOURCES)] = "auto",
+    bop: Annotated[
+        list[str] | None,
+        typer.Option(metavar="DIR[:SPLIT][=WEIGHT]", help="A BOP data set (paper recipe).", rich_help_panel=SOURCES),
+    ] = None,
+    backgrounds: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Photographs for backgrounds.", rich_help_panel=SOURCES)
+    ] = None,
+    init: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WEIGHTS|shipped|none",
+            help="Weights to start from; by default the shipped ones for given meshes, without --config.",
+            rich_help_panel=SOURCES,
+        ),
+    ] = None,
+    flownets: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="FlowNetS checkpoint for the paper's encoder.", rich_help_panel=SOURCES),
+    ] = None,
+    validate_on: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="A BOP data set to measure on.", rich_help_panel=SOURCES)
+    ] = None,
+    recipe: Annotated[Literal["lite", "paper"] | None, typer.Option(help="What is trained, and how.")] = None,
+    config: Annotated[Path | None, typer.Option(metavar="TOML", help="Everything else; options override it.")] = None,
+    minutes: Annotated[float | None, typer.Option(help="Of wall clock.", rich_help_panel=SCHEDULE)] = None,
+    steps: Annotated[int | None, typer.Option(help="Optimiser steps.", rich_help_panel=SCHEDULE)] = None,
+    batch: Annotated[int | None, typer.Option(help="Samples per process and step.", rich_help_panel=SCHEDULE)] = None,
+    rate: Annotated[float | None, typer.Option(help="Highest learning rate.", rich_help_panel=SCHEDULE)] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="The same seed gives the same result.", rich_help_panel=SCHEDULE)
+    ] = None,
+    overfit: Annotated[
+        bool, typer.Option("--overfit", help="Train on one batch only.", rich_help_panel=SCHEDULE)
+    ] = False,
+    devices: Annotated[int | None, typer.Option(help="Processes on this machine.", rich_help_panel=MACHINE)] = None,
+    num_nodes: Annotated[int | None, typer.Option(help="Machines.", rich_help_panel=MACHINE)] = None,
+    accelerator: Annotated[
+        Literal["auto", "cpu", "cuda"] | None, typer.Option(help="What computes.", rich_help_panel=MACHINE)
+    ] = None,
+    precision: Annotated[
+        Literal["32-true", "bf16-mixed", "16-mixed"] | None, typer.Option(help="Of numbers.", rich_help_panel=MACHINE)
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Processes that render, for each that trains.", rich_help_panel=MACHINE)
+    ] = None,
+    threads: Annotated[int | None, typer.Option(help="Threads of torch per process.", rich_help_panel=MACHINE)] = None,
+    profile: Annotated[bool, typer.Option("--profile", help="Write profile.txt.", rich_help_panel=MACHINE)] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the training in --out, as it was begun.")
+    ] = False,
+    force: ForceOption = False,
+) -> None:
+    """Train the pose networks on renderings of your meshes, or of procedural shapes where none are given."""
+    from posekit.train.pose import resume_pose, train_pose
+
+    if resume:
+        with _bar() as show:
+            rows = resume_pose(out, show)
+    else:
+        objects = [*(model or ()), *(meshes or ())]
+        asked = {
+            "recipe": recipe, "minutes": minutes, "steps": steps, "seed": seed,
+            "overfit": overfit or None, "profile": profile or None,
+            "optimiser": {"rate": rate},
+            "machine": {"devices": devices, "nodes": num_nodes, "accelerator": accelerator, "precision": precision,
+                        "workers": workers, "threads": threads},
+            "stream": {"batch": batch},
+            "sources": {"models": _texts(model), "meshes": _texts(meshes), "bop": bop or None, "init": init,
+                        "backgrounds": _text(backgrounds), "flownets": _text(flownets), "units": units,
+                        "validate_on": _text(validate_on)},
+        }  # fmt: skip
+        chosen = _config(config, asked, bool(objects))
+        with _bar() as show:
+            rows = train_pose(chosen, out, show, force)
+    if rows:
+        typer.echo(_report(rows))
+        typer.echo(f"weights: {out}; use them with: posekit estimate --weights {out}")
+
+
+def _config(file: Path | None, asked: dict[str, Any], objects: bool) -> TrainConfig:
+    """Defaults of the recipe, then the file, then what options ask for. Training for given objects starts from the
+    shipped weights, at a lower rate."""
+    from posekit.train.config import changed, default_config, read_config
+
+    config = read_config(file) if file is not None else default_config(asked["recipe"] or "lite")
+    if file is None and config.recipe == "lite" and objects and asked["sources"]["init"] is None:
+        config = changed(
+            config, {"sources": {"init": "shipped"}, "optimiser": {"rate": 2e-4, "warmup": 100}}, "defaults"
+        )
+    if asked["sources"]["init"] == "none":
+        asked["sources"]["init"] = ""
+    if asked["minutes"] is not None and asked["steps"] is None:
+        asked["steps"] = 10**9  # the clock ends the training
+    if asked["steps"] is not None:
+        asked["epochs"] = 0
+    return changed(config, _given(asked), "the command line")
+
+
+def _given(values: dict[str, Any]) -> dict[str, Any]:
+    """Without what was not asked for."""
+    nested = {k: _given(v) if isinstance(v, dict) else v for k, v in values.items()}
+    return {k: v for k, v in nested.items() if v is not None}
+
+
+def _text(path: Path | None) -> str | None:
+    return None if path is None else str(path)
+
+
+def _texts(paths: list[Path] | None) -> list[str] | None:
+    return [str(p) for p in paths] if paths else None
+
+
+MEASURES = (("rotation", "rotation_deg", 1, 2, "degrees"), ("translation", "translation_cm", 1, 2, "cm"),
+            ("within (5, 5)", "within_5", 100, 0, "%"))  # fmt: skip
+FIRST = (("MV-Net's first poses: rotation", "first_rotation_deg", 1, 1, "degrees"),)
+
+
+def _report(rows: list[dict[str, str]]) -> str:
+    """The error before and after, for a person."""
+    before, after = rows[0], rows[-1]
+    lines = [f"{after['step']} steps in {float(after['seconds']) / 60:.1f} minutes; before -> after:"]
+    for prefix, title in (("", "held-back renderings"), ("bop_", "the data set")):
+        found = [
+            f"{name} {float(before[key]) * scale:.{digits}f} -> {float(after[key]) * scale:.{digits}f} {unit}"
+            for name, short, scale, digits, unit in (*MEASURES, *FIRST)
+            if (key := prefix + short) in after and key in before
+        ]
+        if found:
+            lines.append(f"{title}: {', '.join(found)}")
+    return "\n".join(lines)
+
+
+@contextmanager
+def _bar() -> Iterator[Show]:
+    """A progress bar on a terminal; elsewhere nothing."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn(), TimeRemainingColumn())
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("starting", total=1.0)
+
+        def show(progress: Any) -> None:
+            loss = progress.values.get("loss", float("nan"))
+            bar.update(task, completed=progress.done, description=f"step {progress.step}, loss {loss:.3f}")
+
+        yield show

@@ -1,0 +1,315 @@
+"""The training loop, on Lightning Fabric: one process or many, CPU or GPU. Layer 5.
+
+    with batches:  loss, backward, clip, step, average
+    now and then:  log, validate, export, checkpoint
+
+Nothing random outlives a step: batch k is a function of (seed, k), and torch is seeded anew for each step. A checkpoint
+therefore needs the weights, their average, the optimiser's moments and the step's number, and a training that was
+killed ends as one that was not.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel
+from torch.utils.data import DataLoader, IterableDataset
+
+from posekit.errors import ConfigError, TrainingError
+from posekit.files import write_text_atomic
+from posekit.train.checkpoint import Checkpoint, Checkpoints, optimiser_tensors, part, restore_optimiser
+from posekit.train.config import OptimiserConfig, TrainConfig
+from posekit.train.log import Curves
+
+Batch = dict[str, Tensor]
+PROFILED = (3, 10)  # steps that --profile leaves out, and then records
+
+
+class Task(Protocol):
+    """A recipe: what is trained, on what, by which loss.
+
+    nets: the networks alone, whose weights are averaged and kept. module: has ``nets`` inside; its forward takes a
+    batch and a seed for what it draws at random, and gives the loss and its parts.
+    """
+
+    @property
+    def nets(self) -> nn.Module: ...
+
+    @property
+    def module(self) -> nn.Module: ...
+
+    def stream(self, start: int, rank: int) -> IterableDataset[Batch]:
+        """Process ``rank``'s batches from number ``start`` on."""
+        ...
+
+    def prepare(self, batches: Callable[[int], Iterator[Batch]]) -> None:
+        """Measure what has to be known before the first step. Called by one process, for a new training; it must not
+        draw, since worker processes are forked after it. batches: from a number on."""
+        ...
+
+    def validate(self, nets: nn.Module) -> dict[str, float]:
+        """Measures of ``nets``, with ``score``, the lower the better. Called by one process."""
+        ...
+
+    def export(self, nets: nn.Module, out: Path, about: Mapping[str, Any]) -> None:
+        """Write ``nets`` into ``out`` as the estimator loads them."""
+        ...
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a progress bar may show. done: in [0, 1]. values: running means of the loss and its parts."""
+
+    step: int
+    done: float
+    seconds: float
+    values: Mapping[str, float]
+
+
+Show = Callable[[Progress], None]
+
+
+def rate_at(step: int, done: float, config: OptimiserConfig) -> float:
+    """Linear warm-up by steps, then a cosine by the share ``done`` of the whole training down to the floor."""
+    warm = min(1.0, (step + 1) / max(1, config.warmup))
+    return config.rate * warm * (config.floor + (1 - config.floor) * 0.5 * (1 + math.cos(math.pi * min(1.0, done))))
+
+
+def make_fabric(config: TrainConfig) -> Any:
+    """Lightning Fabric for the configured machines, launched: under torchrun, Slurm and so on as these say, else it
+    starts this program again for each further process. Raises ConfigError where Fabric is not installed."""
+    try:
+        from lightning_fabric import Fabric
+        from lightning_fabric.plugins.environments.torchelastic import TorchElasticEnvironment
+    except ImportError as error:
+        raise ConfigError("training needs Lightning Fabric: pip install 'posekit[train]'.") from error
+    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # it tells every run what was asked for
+    machine = config.machine
+    accelerator = machine.accelerator
+    if accelerator == "auto":
+        accelerator = "cuda" if torch.cuda.is_available() else "cpu"
+    several = config.world > 1 or TorchElasticEnvironment.detect()
+    strategy = "ddp" if several else "auto"
+    try:
+        fabric = Fabric(accelerator=accelerator, devices=machine.devices, num_nodes=machine.nodes, strategy=strategy,
+                        precision=machine.precision)  # type: ignore[arg-type]  # fmt: skip
+        fabric.launch()
+    except (RuntimeError, ValueError) as error:
+        raise ConfigError(
+            f"the training cannot start on {machine.devices} x {accelerator} of {machine.nodes} machine(s), "
+            f"precision {machine.precision}: {error}"
+        ) from error
+    if machine.threads:
+        torch.set_num_threads(machine.threads)
+    return fabric
+
+
+def make_optimiser(nets: nn.Module, config: TrainConfig) -> torch.optim.Optimizer:
+    """Weight decay on weights only, neither on biases nor on norms."""
+    chosen = config.optimiser
+    weights = [p for p in nets.parameters() if p.ndim > 1]
+    others = [p for p in nets.parameters() if p.ndim <= 1]
+    groups = [{"params": weights, "weight_decay": chosen.decay}, {"params": others, "weight_decay": 0.0}]
+    if chosen.kind == "sgd":
+        return torch.optim.SGD(groups, lr=chosen.rate, momentum=chosen.momentum)
+    return torch.optim.AdamW(groups, lr=chosen.rate, fused=config.machine.precision != "16-mixed")
+
+
+def _show_nothing(progress: Progress) -> None:
+    """Where nobody watches."""
+
+
+class Trainer:
+    """One training in the folder ``out``. show: called after every step by the first process."""
+
+    def __init__(self, config: TrainConfig, task: Task, fabric: Any, out: Path, show: Show | None = None) -> None:
+        self.config, self.task, self.fabric, self.out = config, task, fabric, out
+        self.show = show or _show_nothing
+        self.first = fabric.global_rank == 0
+        self.checkpoints = Checkpoints(out / "checkpoints", config.keep)
+        raw = make_optimiser(task.nets, config)
+        self.module, self.optimiser = fabric.setup(task.module, raw)
+        self.raw = raw
+        self.average = AveragedModel(task.nets, multi_avg_fn=self._average, use_buffers=True)
+        self.step, self.seconds, self.score = 0, 0.0, math.nan
+        self.means: dict[str, float] = {}
+
+    # --- the loop ---
+
+    def run(self) -> list[dict[str, str]]:
+        """Train to the end; returns the validations' rows, the first before and the last after the training.
+
+        Goes on from the last checkpoint where there is one. Raises TrainingError where the loss is not finite,
+        OutputError where the disk is full.
+        """
+        resumed = self._resume()
+        if not resumed:
+            self._start()
+        batches = self._batches(self.step)
+        curves = Curves(self.out, self.step) if self.first else None
+        if curves and not curves.rows("validation"):
+            self._validate(curves)
+        clock = time.monotonic() - self.seconds
+        overfitted = next(batches) if self.config.overfit else None
+        try:
+            with self._profiler() as profiler:
+                while (done := self._done()) < 1:
+                    started = time.monotonic()
+                    batch = overfitted or next(batches)
+                    waited = time.monotonic() - started
+                    self.train_step(batch, done, {"waited": waited})
+                    self.seconds = time.monotonic() - clock
+                    if profiler is not None:
+                        profiler.step()
+                    if curves:
+                        self._now_and_then(curves)
+        finally:
+            if curves:
+                curves.close()
+        self.fabric.barrier()
+        return curves.rows("validation") if curves else []
+
+    def _batches(self, start: int) -> Iterator[Batch]:
+        return loader(self.task.stream(start, self.fabric.global_rank), self.config.machine.workers)
+
+    def train_step(self, batch: Batch, done: float, also: Mapping[str, float] | None = None) -> dict[str, float]:
+        """One optimiser step; returns the loss and its parts. also: further values to log."""
+        rank, world = self.fabric.global_rank, self.fabric.world_size
+        drawn = 0 if self.config.overfit else self.step
+        seed = (self.config.seed * 1_000_003 + drawn) * world + rank
+        torch.manual_seed(seed)
+        for group in self.raw.param_groups:
+            group["lr"] = rate_at(self.step, done, self.config.optimiser)
+        self.module.train()
+        loss, parts = self.module(self.fabric.to_device(batch), seed)
+        self.raw.zero_grad(set_to_none=True)
+        self.fabric.backward(loss)
+        norm = self.fabric.clip_gradients(
+            self.module, self.optimiser, max_norm=self.config.optimiser.clip, error_if_nonfinite=False
+        )
+        self._check_finite(float(loss.detach()), float(norm))
+        self.optimiser.step()
+        self.average.update_parameters(self.task.nets)
+        self.step += 1
+        values = {"loss": float(loss.detach()), **parts, "norm": float(norm), **(also or {})}
+        self.means = {k: v if k not in self.means else 0.98 * self.means[k] + 0.02 * v for k, v in values.items()}
+        return values
+
+    def _check_finite(self, loss: float, norm: float) -> None:
+        """The gradient is averaged over all processes: one that is not finite stops them together, before the weights
+        are changed. With 16-mixed a gradient may overflow, and the scaler leaves out that step."""
+        if math.isfinite(loss) and (math.isfinite(norm) or self.config.machine.precision == "16-mixed"):
+            return
+        last = self.checkpoints.last()
+        held = (
+            f"the checkpoint of step {last} in {self.checkpoints.folder} is intact"
+            if last is not None
+            else "no checkpoint was written before"
+        )
+        raise TrainingError(
+            f"the loss became {loss} at step {self.step} (norm of the gradient {norm}); {held}. "
+            "Start from it with --resume and a lower --rate, or look at the meshes and pictures given."
+        )
+
+    def _done(self) -> float:
+        """How much of the training is behind, the same number in all processes."""
+        done = self.step / self.config.steps
+        if self.config.minutes > 0:
+            done = max(done, self.seconds / (60 * self.config.minutes))
+            if self.fabric.world_size > 1:
+                done = self.fabric.broadcast(done)
+        return float(done)
+
+    def _now_and_then(self, curves: Curves) -> None:
+        self.show(Progress(self.step, self._share(), self.seconds, self.means))
+        ended = self._share() >= 1
+        if self.step % self.config.log == 0 or ended:
+            curves.add("train", self.step, self.seconds, self.means)
+        self.score = math.nan
+        if self.step % self.config.validate == 0 or ended:
+            self._validate(curves)
+        if self.step % self.config.save == 0 or ended:
+            self.save()
+
+    def _share(self) -> float:
+        """As `_done`, by this process's own clock."""
+        byclock = self.seconds / (60 * self.config.minutes) if self.config.minutes > 0 else 0.0
+        return max(self.step / self.config.steps, byclock)
+
+    def _validate(self, curves: Curves) -> None:
+        averaged = self.average.module
+        averaged.eval()
+        with torch.no_grad():
+            found = self.task.validate(averaged)
+        self.score = found["score"]
+        curves.add("validation", self.step, self.seconds, found)
+        about = {"recipe": self.config.recipe, "steps": self.step, "hours": self.seconds / 3600, "held_back": found}
+        self.task.export(averaged, self.out, about)
+
+    # --- state ---
+
+    def _start(self) -> None:
+        """A new training: measure, and tell the other processes."""
+        if self.first:
+            self.task.prepare(self._batches)
+        if self.fabric.world_size > 1:
+            state = self.fabric.broadcast({k: v.cpu() for k, v in self.task.nets.state_dict().items()})
+            self.task.nets.load_state_dict(state)
+        self.average.module.load_state_dict(self.task.nets.state_dict())
+
+    def save(self) -> None:
+        """Write a checkpoint. Raises OutputError."""
+        state = {f"net.{k}": v for k, v in self.task.nets.state_dict().items()}
+        state |= {f"average.{k}": v for k, v in self.average.state_dict().items()}
+        state |= {f"optimiser.{k}": v for k, v in optimiser_tensors(self.raw).items()}
+        self.checkpoints.save(Checkpoint(self.step, self.seconds, self.score, self.means, state))
+
+    def _resume(self) -> bool:
+        """Take over the last checkpoint, whose number the first process decides."""
+        step = self.fabric.broadcast(self.checkpoints.last())
+        if step is None:
+            return False
+        found = self.checkpoints.load(step)
+        self.step, self.seconds, self.means = found.step, found.seconds, dict(found.means)
+        self.task.nets.load_state_dict(part(found.tensors, "net."))
+        self.average.load_state_dict(part(found.tensors, "average."))
+        restore_optimiser(self.raw, part(found.tensors, "optimiser."))
+        return True
+
+    @torch.no_grad()
+    def _average(self, averages: Sequence[Tensor], currents: Sequence[Tensor], count: Tensor | int) -> None:
+        """An exponential moving average that forgets its first values faster: the decay grows to ``ema``."""
+        decay = min(self.config.optimiser.ema, (1.0 + float(count)) / (10.0 + float(count)))
+        for average, current in zip(averages, currents, strict=True):
+            if average.is_floating_point():
+                average.lerp_(current.to(average.dtype), 1.0 - decay)
+            else:
+                average.copy_(current)
+
+    def _profiler(self) -> AbstractContextManager[Any]:
+        """With --profile: where the time of a few steps went, in ``profile.txt``."""
+        if not (self.config.profile and self.first):
+            return nullcontext()
+        skipped, recorded = PROFILED
+        return torch.profiler.profile(
+            schedule=torch.profiler.schedule(wait=skipped - 1, warmup=1, active=recorded, repeat=1),
+            on_trace_ready=lambda p: write_text_atomic(
+                self.out / "profile.txt", p.key_averages().table(sort_by="self_cpu_time_total", row_limit=40)
+            ),
+        )
+
+
+def loader(stream: IterableDataset[Batch], workers: int) -> Iterator[Batch]:
+    """A stream's batches, made in ``workers`` processes (0: in this one) while the network trains."""
+    context = "fork" if workers else None  # the workers share the pictures and meshes that are loaded already
+    return iter(DataLoader(stream, batch_size=None, num_workers=workers, multiprocessing_context=context,
+                           prefetch_factor=6 if workers else None))  # fmt: skip

@@ -1,0 +1,75 @@
+"""What the recipes share: measuring and exporting. Layer 5."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from torch import nn
+
+from posekit.nets.heads import PoseHeads
+from posekit.nets.weights import Networks, save_networks
+from posekit.object_model import ObjectModel
+from posekit.render import Renderer
+from posekit.train.config import TrainConfig
+from posekit.train.measure import Case, bop_cases, held_back_cases, measure
+from posekit.train.sources import Sources
+
+
+class PoseTask:
+    """SV-Net and, where it is trained, MV-Net.
+
+    fresh: the networks that have no measured statistics yet. models: the meshes of the held-back renderings.
+    """
+
+    def __init__(self, config: TrainConfig, networks: Networks, sources: Sources, fresh: frozenset[str],
+                 models: list[ObjectModel], with_mvnet: bool) -> None:  # fmt: skip
+        self.config, self.networks, self.sources, self.models = config, networks, sources, models
+        nets: dict[str, nn.Module] = {"svnet": networks.svnet}
+        if with_mvnet:
+            assert networks.mvnet is not None
+            nets["mvnet"] = networks.mvnet
+        self.nets = nn.ModuleDict(nets)
+        self.fresh = fresh & set(nets)
+
+    def heads(self, name: str) -> PoseHeads:
+        heads = self.nets[name].heads
+        assert isinstance(heads, PoseHeads)
+        return heads
+
+    def validate(self, nets: nn.Module) -> dict[str, float]:
+        """Measures of the held-back renderings and, as ``bop_*``, of the data set to validate on; the score is the
+        data set's where there is one."""
+        networks = self._with(copy.deepcopy(nets).cpu())
+        found = measure(self.cases, networks, self.renderer) if self.cases else {}
+        if self.bop:
+            found |= {f"bop_{k}": v for k, v in measure(self.bop, networks, self.renderer).items()}
+        return {"score": found.get("bop_add", found.get("add", 0.0)), **found}
+
+    def export(self, nets: nn.Module, out: Path, about: Mapping[str, Any]) -> None:
+        about = {**self.networks.about, **about, "trained_on": self.sources.about}
+        save_networks(out / self.networks.preset, self._with(nets), about)
+
+    def _with(self, nets: nn.Module) -> Networks:
+        """The networks that ``nets`` holds."""
+        assert isinstance(nets, nn.ModuleDict)
+        return dataclasses.replace(self.networks, svnet=nets["svnet"], mvnet=dict(nets).get("mvnet"))  # type: ignore[arg-type]
+
+    @cached_property
+    def renderer(self) -> Renderer:
+        return Renderer()
+
+    @cached_property
+    def cases(self) -> list[Case]:
+        stream = self.config.stream
+        return held_back_cases(self.renderer, self.models, self.sources.photos, stream.scenes, stream.augment,
+                               self.config.cases)  # fmt: skip
+
+    @cached_property
+    def bop(self) -> list[Case]:
+        held = self.sources.validation
+        return bop_cases(held, self.config.cases) if held is not None else []
