@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from objects import bracket
 
+from objects import bracket
 from posekit.data.tabletop import DISTRACTOR, TabletopConfig, compose, procedural_objects, resting_rotation
 from posekit.errors import ConfigError
 from posekit.render import Renderer

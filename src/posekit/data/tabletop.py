@@ -270,9 +270,11 @@ class _Canvas:
     def _paste(
         self, image: Image, mask: NDArray[np.bool_], depth: NDArray[np.float32], left: int, top: int, label: int
     ) -> None:
-        height, width = self.labels.shape
-        here = np.s_[max(0, top) : min(height, top + len(mask)), max(0, left) : min(width, left + mask.shape[1])]
-        there = np.s_[here[0].start - top : here[0].stop - top, here[1].start - left : here[1].stop - left]
+        width, height = self.camera.size
+        first, last = max(0, top), min(height, top + mask.shape[0])
+        start, stop = max(0, left), min(width, left + mask.shape[1])
+        here = (slice(first, last), slice(start, stop))
+        there = (slice(first - top, last - top), slice(start - left, stop - left))
         mine, known = depth[there], self.depth[here]
         nearer = mask[there] & ((known == 0) | (mine < known))
         self.image[here][nearer] = image[there][nearer]
