@@ -109,7 +109,8 @@ def compose(
     photos: Sequence[Image] = (),
 ) -> Tabletop:
     """A random scene. objects: to draw from, with repetition. distractors: other meshes to draw from, of about the
-    objects' sizes (see `procedural_objects` and `resized`). Raises ConfigError where there are neither objects nor distractors."""
+    objects' sizes (see `procedural_objects` and `resized`). Raises ConfigError where there are
+    neither objects nor distractors."""
     if not len(objects) and not len(distractors):
         raise ConfigError("a scene needs meshes: pass objects or distractors.")
     unit = float(np.median([m.diameter for m in (objects or distractors)]))

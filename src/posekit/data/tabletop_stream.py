@@ -26,8 +26,8 @@ AGNOSTIC_SHARE = 0.5  # of given meshes among the objects of class-agnostic scen
 
 @dataclass(frozen=True)
 class TabletopStreamConfig:
-    """batch: scenes in a batch. pool: scenes kept to draw from. reuse: how often each is used, mirrored and photographed
-    anew. per_block: scenes composed from one set of procedural meshes. meshes: procedural meshes in a set. visible:
+    """batch: scenes in a batch. pool: scenes kept to draw from. reuse: how often each is used, mirrored and
+    photographed anew. per_block: scenes composed from one set of procedural meshes. meshes: procedural meshes in a set. visible:
     least visible share of an instance that is to be found. least_px: its least visible pixels."""
 
     batch: int = 4
@@ -56,8 +56,8 @@ class LabelledImage:
 
 
 def labelled_scenes(
-    renderer: Renderer, models: Sequence[ObjectModel], agnostic: bool, count: int, config: TabletopStreamConfig, rng: Rng,
-    photos: Sequence[Image],
+    renderer: Renderer, models: Sequence[ObjectModel], agnostic: bool, count: int, config: TabletopStreamConfig,
+    rng: Rng, photos: Sequence[Image],
 ) -> list[LabelledImage]:  # fmt: skip
     """``count`` scenes over one set of fresh procedural meshes.
 

@@ -56,9 +56,9 @@ class Lite0(nn.Module):
         self.stages = nn.ModuleList()
         inputs = 32
         for repeats, kernel, stride, expansion, outputs in _STAGES:
-            blocks = [InvertedResidual(inputs if k == 0 else outputs, outputs, kernel, stride if k == 0 else 1, expansion)
-                      for k in range(repeats)]  # fmt: skip
-            self.stages.append(nn.Sequential(*blocks))
+            first = InvertedResidual(inputs, outputs, kernel, stride, expansion)
+            rest = [InvertedResidual(outputs, outputs, kernel, 1, expansion) for _ in range(repeats - 1)]
+            self.stages.append(nn.Sequential(first, *rest))
             inputs = outputs
         for module in (self.stem, *self.stages[:frozen]):
             module.requires_grad_(False)
