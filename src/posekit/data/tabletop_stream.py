@@ -27,8 +27,8 @@ AGNOSTIC_SHARE = 0.5  # of given meshes among the objects of class-agnostic scen
 @dataclass(frozen=True)
 class TabletopStreamConfig:
     """batch: scenes in a batch. pool: scenes kept to draw from. reuse: how often each is used, mirrored and
-    photographed anew. per_block: scenes composed from one set of procedural meshes. meshes: procedural meshes in a set. visible:
-    least visible share of an instance that is to be found. least_px: its least visible pixels."""
+    photographed anew. per_block: scenes composed from one set of procedural meshes. meshes: procedural meshes in
+    a set. visible: least visible share of an instance that is to be found. least_px: its least visible pixels."""
 
     batch: int = 4
     pool: int = 64
