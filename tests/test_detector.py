@@ -42,7 +42,7 @@ from posekit.train.config import MachineConfig, OptimiserConfig, write_config
 from posekit.train.detector import DetectorConfig, DetectorModule, read_config, target, train_detector
 from posekit.view import View
 
-TINY = MaskRCNNConfig(size=(128, 96), channels=16, hidden=32, proposals=(20, 20), samples=16)
+TINY = MaskRCNNConfig(size=(128, 96), use_size=(128, 96), channels=16, hidden=32, proposals=(20, 20), samples=16)
 SCENES = TabletopStreamConfig(
     batch=2, pool=4, per_block=2, reuse=2, meshes=2, scenes=TabletopConfig(size=(128, 96), distractors=(1, 2))
 )

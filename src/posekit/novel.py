@@ -41,7 +41,7 @@ class NovelOptions:
     detections of a mesh. features: weight of the features against the templates. views: pictures of a mesh whose
     features are kept. overlap: intersection over union from which two detections are of one instance."""
 
-    proposals: int = 25
+    proposals: int = 40
     least_proposal: float = 0.1
     least: float = 0.5
     most: int = 3

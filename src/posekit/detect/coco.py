@@ -24,7 +24,7 @@ Mask = NDArray[np.bool_]
 @dataclass(frozen=True, eq=False)
 class Truth:
     """The instances of a picture. labels: (N,), numbers of classes; masks: N of bool (H, W), none empty. ignored:
-    (N,), True where finding one counts neither for nor against; empty = none."""
+    (N,), True where finding one counts neither for nor against (COCO's crowds); empty = none."""
 
     labels: NDArray[np.int64]
     masks: Sequence[Mask]
@@ -74,7 +74,7 @@ def average_precision(truths: Sequence[Truth], found: Sequence[Found]) -> dict[s
             assert box is not None
             ignored = int(bool(len(truth.ignored)) and truth.ignored[k])
             annotations.append({"id": len(annotations) + 1, "image_id": image, "category_id": int(label) + 1,
-                                "bbox": xywh(box), "area": float(mask.sum()), "iscrowd": 0, "ignore": ignored,
+                                "bbox": xywh(box), "area": float(mask.sum()), "iscrowd": ignored,
                                 "segmentation": encode(mask)})  # fmt: skip
         for k, label in enumerate(here.labels):
             x0, y0, x1, y1 = (float(v) for v in here.boxes[k])

@@ -35,13 +35,14 @@ COCO = "coco"
 @dataclass(frozen=True)
 class MaskRCNNConfig:
     """backbone: "lite0" or "resnet50". classes: names, without the ground. size: (width, height) that pictures are
-    fitted into. channels: of the pyramid. hidden: width of the box head. anchors: sides, one for each level of the
+    fitted into in training. use_size: the same in use; small objects want it larger. channels: of the pyramid. hidden: width of the box head. anchors: sides, one for each level of the
     pyramid, pixels. proposals: regions kept in training and in use. samples: regions that the heads learn from in a
     picture."""
 
     backbone: str = "lite0"
     classes: tuple[str, ...] = NOVEL
     size: tuple[int, int] = (320, 240)
+    use_size: tuple[int, int] = (480, 360)
     channels: int = 64
     hidden: int = 256
     anchors: tuple[int, ...] = (16, 32, 64, 128)
@@ -62,7 +63,9 @@ class MaskRCNNConfig:
 
 def paper_config(classes: Sequence[str]) -> MaskRCNNConfig:
     """ResNet-50 with FPN as in the paper, at 640x480."""
-    return MaskRCNNConfig("resnet50", tuple(classes), (640, 480), 256, 1024, (32, 64, 128, 256, 512), (1000, 300), 256)
+    return MaskRCNNConfig(
+        "resnet50", tuple(classes), (640, 480), (640, 480), 256, 1024, (32, 64, 128, 256, 512), (1000, 300), 256
+    )
 
 
 def build(config: MaskRCNNConfig, *, imagenet: bool = False) -> Any:
@@ -171,7 +174,7 @@ def load_coco() -> TrainedDetector:
             "--detector novel, or weights of posekit train detector."
         ) from error
     classes = tuple(weights.meta["categories"][1:])
-    config = dataclasses.replace(paper_config(classes), size=(1333, 800))
+    config = dataclasses.replace(paper_config(classes), use_size=(1333, 800))
     return TrainedDetector(config, network.eval(), str(weights), {"trained_on": "COCO"})
 
 
@@ -205,9 +208,19 @@ class Found:
     masks: NDArray[np.bool_]
 
 
-def find(detector: TrainedDetector, image: NDArray[np.uint8], *, least: float = 0.05, most: int = 50) -> Found:
-    """Run the network on uint8 RGB (H, W, 3). least: score below which nothing is reported. most: detections."""
+def find(
+    detector: TrainedDetector,
+    image: NDArray[np.uint8],
+    *,
+    least: float = 0.05,
+    most: int = 50,
+    size: tuple[int, int] | None = None,
+) -> Found:
+    """Run the network on uint8 RGB (H, W, 3). least: score below which nothing is reported. most: detections. size:
+    (width, height) that the picture is fitted into, by default the configuration's ``use_size``."""
     network = detector.network
+    size = size or detector.config.use_size
+    network.transform.min_size, network.transform.max_size = (min(size),), max(size)
     network.roi_heads.score_thresh, network.roi_heads.detections_per_img = least, most
     pixels = torch.from_numpy(image).permute(2, 0, 1).float() / 255
     with torch.inference_mode():

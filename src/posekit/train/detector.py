@@ -216,7 +216,7 @@ class DetectorTask:
         nets.eval()
         detector = TrainedDetector(self.config.network, nets)
         truths = [truth(scene) for scene in self.held_back]
-        found = [find(detector, scene.image) for scene in self.held_back]
+        found = [find(detector, scene.image, size=self.config.network.size) for scene in self.held_back]
         measured = average_precision(truths, found)
         return {"score": 1.0 - measured["mask_ap50"], **measured}
 
@@ -252,7 +252,8 @@ def make_network(config: DetectorConfig) -> nn.Module:
         fresh: nn.Module = build(config.network, imagenet=True)
         return fresh
     found = load_detector(Path(init))
-    if dataclasses.replace(found.config, classes=NOVEL) != dataclasses.replace(config.network, classes=NOVEL):
+    shape = {"classes": NOVEL, "size": (1, 1), "use_size": (1, 1)}  # may differ
+    if dataclasses.replace(found.config, **shape) != dataclasses.replace(config.network, **shape):  # type: ignore[arg-type]
         raise ConfigError(f"the detector {init} is of another shape ({found.config}) than [network] asks for.")
     network: nn.Module = build(config.network)
     own = network.state_dict()
