@@ -1,8 +1,8 @@
 """Objects that no detector was trained for: class-agnostic proposals, compared with a mesh's templates. Layer 4.
 
-A class-agnostic Mask R-CNN proposes instances of anything. Each is compared with the mesh in two ways: by the template
+A class-agnostic Mask R-CNN proposes instances of anything. Each is compared with the mesh: by the template
 search that also gives first poses (silhouette and normalised colour), and by the proposal network's own features,
-averaged over the silhouette. docs/decisions tells what each is worth.
+averaged over the silhouette, and by their median chroma. docs/decisions tells what each is worth.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
+import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -38,14 +39,17 @@ MARGIN = 1.1
 @dataclass(frozen=True)
 class NovelOptions:
     """proposals: of a picture at most. least_proposal: their least score. least: the least score of a detection. most:
-    detections of a mesh. features: weight of the features against the templates. views: pictures of a mesh whose
-    features are kept. overlap: intersection over union from which two detections are of one instance."""
+    detections of a mesh. features: weight of the features against the templates. chroma: difference of the
+    median a and b (CIELAB, 8 bits) at which a score falls to 1/e. objectness: power of the proposal's own score. views:
+    pictures of a mesh whose features are kept. overlap: intersection over union from which two detections are of one instance."""
 
     proposals: int = 40
     least_proposal: float = 0.1
-    least: float = 0.5
+    least: float = 0.3
     most: int = 3
-    features: float = 2.0
+    features: float = 1.0
+    chroma: float = 60.0
+    objectness: float = 0.2
     views: int = 66
     overlap: float = 0.5
 
@@ -67,7 +71,7 @@ class NovelDetector:
                 "class-agnostic weights, or use it for its own classes."
             )
         self.detector, self.renderer, self.options = detector, renderer, options
-        self._known: WeakKeyDictionary[ObjectModel, tuple[TemplateSearch, FArray | None]] = WeakKeyDictionary()
+        self._known: WeakKeyDictionary[ObjectModel, tuple[TemplateSearch, FArray | None, FArray]] = WeakKeyDictionary()
 
     def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
         """The instances of the models, each model's best first; with no models, whatever looks like an object."""
@@ -94,7 +98,7 @@ class NovelDetector:
     def _similarities(
         self, view: View, model: ObjectModel, proposals: Sequence[Detection], seen: FArray | None
     ) -> list[float]:
-        search, features = self._of(model)
+        search, features, chroma = self._of(model)
         weight = self.options.features if features is not None else 0.0
         scores = []
         for k, proposal in enumerate(proposals):
@@ -102,7 +106,9 @@ class NovelDetector:
             score = max(0.0, first[0].score) / (1 + search.options.colour) if first else 0.0
             if features is not None and seen is not None:
                 score += weight * max(0.0, float((features @ seen[k]).max()))
-            scores.append(min(1.0, score / (1 + weight)))
+            apart = float(np.linalg.norm(chroma - _chroma([self._crop(view, proposal)]), axis=1).min())
+            faded = float(np.exp(-apart / self.options.chroma)) * proposal.score**self.options.objectness
+            scores.append(min(1.0, score / (1 + weight)) * faded)
         return scores
 
     def _instances(
@@ -118,10 +124,11 @@ class NovelDetector:
                 kept.append(Detection(proposal.box, proposal.mask, score, model.name, "novel"))
         return kept
 
-    def _of(self, model: ObjectModel) -> tuple[TemplateSearch, FArray | None]:
+    def _of(self, model: ObjectModel) -> tuple[TemplateSearch, FArray | None, FArray]:
         if model not in self._known:
             search = TemplateSearch(model, self.renderer)
-            self._known[model] = search, self._features(self._pictures(model))
+            pictures = self._pictures(model)
+            self._known[model] = search, self._features(pictures), _chroma(pictures)
         return self._known[model]
 
     def _pictures(self, model: ObjectModel) -> list[View]:
@@ -151,6 +158,16 @@ class NovelDetector:
             share = F.avg_pool2d(masks, STRIDE)
             pooled = (out * share).sum((2, 3)) / (share.sum((2, 3)) + 1e-6)
             return np.asarray(F.normalize(pooled, dim=1).numpy(), np.float32)
+
+
+def _chroma(pictures: Sequence[View]) -> FArray:
+    """The median a and b (CIELAB, 8 bits) over each silhouette, (N, 2)."""
+    rows = []
+    for picture in pictures:
+        mask = picture.mask
+        inside = mask if mask is not None and mask.any() else np.ones(picture.image.shape[:2], np.bool_)
+        rows.append(np.median(cv2.cvtColor(picture.image, cv2.COLOR_RGB2LAB)[inside][:, 1:], axis=0))
+    return np.asarray(rows, np.float32).reshape(-1, 2)
 
 
 def _overlap(a: Detection, b: Detection) -> float:

@@ -35,9 +35,9 @@ COCO = "coco"
 @dataclass(frozen=True)
 class MaskRCNNConfig:
     """backbone: "lite0" or "resnet50". classes: names, without the ground. size: (width, height) that pictures are
-    fitted into in training. use_size: the same in use; small objects want it larger. channels: of the pyramid. hidden: width of the box head. anchors: sides, one for each level of the
-    pyramid, pixels. proposals: regions kept in training and in use. samples: regions that the heads learn from in a
-    picture."""
+    fitted into in training. use_size: the same in use; small objects want it larger. channels: of the
+    pyramid. hidden: width of the box head. anchors: sides, one for each level of the pyramid, pixels. proposals:
+    regions kept in training and in use. samples: regions that the heads learn from in a picture."""
 
     backbone: str = "lite0"
     classes: tuple[str, ...] = NOVEL
