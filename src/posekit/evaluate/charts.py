@@ -1,4 +1,4 @@
-"""Charts as SVG text, for the report. Their colours are the page's CSS variables: they follow its light or dark mode."""
+"""Charts as SVG text, for the report. Colours are the page's CSS variables and follow its light or dark mode."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def histogram(axes: Axes, values: ArrayLike, bins: int, title: str) -> str:
     edges = np.linspace(axes.x_from, axes.x_to, bins + 1)
     counts, _ = np.histogram(np.clip(data, axes.x_from, axes.x_to), edges)
     shares = 100.0 * counts / max(1, len(data))
-    top = float(np.ceil(max(shares.max(), 1.0) / 5.0) * 5.0)
+    top = nice_top(max(float(shares.max()), 1.0))
     scaled = Axes(axes.x_label, axes.y_label, axes.x_to, top, axes.x_from)
     bars = "".join(
         f'<rect class="bar" x="{scaled.x(a) + 0.5:.1f}" y="{scaled.y(s):.1f}" '
@@ -95,13 +95,19 @@ def spark(values: Sequence[float], width: int = 120, height: int = 26) -> str:
     return f'<svg class="spark" viewBox="0 0 {width} {height}"><polyline class="line c0" points="{points}"/></svg>'
 
 
+def nice_top(value: float) -> float:
+    """The next of 1, 2, 2.5, 5 and 10 times a power of ten: five ticks below it are short numbers."""
+    power = 10.0 ** np.floor(np.log10(max(value, 1e-9)))
+    return float(next(step * power for step in (1, 2, 2.5, 5, 10) if step * power >= value))
+
+
 def _chart(axes: Axes, content: str, title: str) -> str:
     bottom, right = HEIGHT - _BOTTOM, WIDTH - _RIGHT
     grid = []
     for k in range(6):
         x, y = axes.x_from + (axes.x_to - axes.x_from) * k / 5, axes.y_to * k / 5
         grid.append(f'<line class="grid" x1="{_LEFT}" x2="{right}" y1="{axes.y(y):.1f}" y2="{axes.y(y):.1f}"/>')
-        grid.append(f'<text class="left" x="{_LEFT - 6}" y="{axes.y(y) + 4:.1f}">{y:g}</text>')
+        grid.append(f'<text class="left" x="{_LEFT - 6}" y="{axes.y(y) + 4:.1f}">{y:.3g}</text>')
         grid.append(f'<text class="middle" x="{axes.x(x):.1f}" y="{bottom + 15}">{x:.3g}</text>')
     labels = (
         f'<text class="middle" x="{(_LEFT + right) / 2}" y="{HEIGHT - 6}">{escape(axes.x_label)}</text>'

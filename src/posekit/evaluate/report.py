@@ -181,7 +181,7 @@ def _traces(scored: Scored) -> str:
     for k, label in enumerate(("rotation error, degrees", "translation error, cm")):
         held = np.array([np.pad(t[k], (0, max(0, longest - len(t[k]))), mode="edge")[:longest] for t in traces])
         quartiles = np.percentile(held, [75, 50, 25], axis=0)
-        top = float(np.ceil(max(quartiles.max(), 0.1) * 1.15 * 10) / 10)
+        top = charts.nice_top(max(float(quartiles.max()), 0.1))
         axes = charts.Axes("step", label, float(max(1, longest - 1)), top)
         curves = [(name, x, q) for name, q in zip(("3 of 4 below", "median", "1 of 4 below"), quartiles, strict=True)]
         parts.append(charts.lines(axes, curves, f"{label.split(',')[0]} by step"))
@@ -198,8 +198,9 @@ def _traces(scored: Scored) -> str:
 def _cases(scored: Scored, data: Dataset) -> str:
     order = np.argsort(scored.errors["mssd_share"], kind="stable")
     renderer = Renderer()
-    best = [_case(scored, int(k), data, renderer) for k in order[:SHOWN]]
-    worst = [_case(scored, int(k), data, renderer) for k in order[::-1][:SHOWN]]
+    count = min(SHOWN, len(order) // 2)  # nothing is shown twice
+    best = [_case(scored, int(k), data, renderer) for k in order[: len(order) - count][:SHOWN]]
+    worst = [_case(scored, int(k), data, renderer) for k in order[::-1][:count]]
     note = "<p class=soft>Orange: the truth. Green: the estimate. The line: rotation error by refinement step.</p>"
     return _section("Best cases", f"{note}<div class=cases>{''.join(best)}</div>") + _section(
         "Worst cases", f"<div class=cases>{''.join(worst)}</div>"
