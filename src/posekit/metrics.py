@@ -78,7 +78,7 @@ def adds(estimated: Poses, truth: Poses, points: ArrayLike) -> Array:
     need one search tree for all poses.
     """
     cloud = np.asarray(points, dtype=np.float64)
-    tree = cKDTree(cloud)
+    tree = cKDTree(cloud, leafsize=32)
     est, gt = np.broadcast_arrays(_matrices(estimated), _matrices(truth))
     between = _inverse(est) @ gt
     return _by_chunk(lambda T: tree.query(_moved(T, cloud), workers=-1)[0].mean(axis=-1), len(cloud), between)
