@@ -15,11 +15,7 @@ import typer
 from typer.core import TyperGroup
 
 from posekit._version import __version__
-<<<<<<< HEAD
-from posekit.cli import demo, detect, doctor, estimate, refine, render_views, train
-=======
-from posekit.cli import demo, doctor, download, estimate, eval, refine, render_views, train
->>>>>>> main
+from posekit.cli import demo, detect, doctor, download, estimate, eval, refine, render_views, train
 from posekit.errors import PosekitError
 
 INTERRUPTED = 130  # as shells count it: 128 + SIGINT
