@@ -215,7 +215,7 @@ def worker_lane(start: int) -> tuple[int, int]:
 
 
 def collate(samples: Sequence[Sample]) -> Batch:
-    """observed, rendered: uint8 (B, H, W, 4); flow (B, 2, h, w); relief (B, h, w); focal (B,); valid, visible (B, h, w); the rest (B, ...)."""
+    """observed, rendered: uint8 (B, H, W, 4); flow (B, 2, h, w); relief, valid, visible (B, h, w); others (B, ...)."""
     pairs = [s.pair for s in samples]
 
     def stack(arrays: Sequence[NDArray]) -> Tensor:  # type: ignore[type-arg]

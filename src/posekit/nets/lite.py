@@ -1,10 +1,11 @@
 """The preset that a laptop runs: a shared tower, exchange between both crops, matching, a dense head.
 
-A shared tower describes the observed and the rendered crop, another one the two laid over each other; exchange blocks (convolutions within a crop, attention across
-the two) tell every cell of one what the other shows, and the rendered cells also know where their surface lies in
-space. Matching all pairs of cells gives a first flow (GMFlow's way: Xu et al., 2022) and that a rigid motion; where
-this motion says that both crops show the same, a head at 1/4 resolution compares them and gives the fine flow with
-its uncertainty and visibility. The paper's heads stand on the rendered cells.
+A shared tower describes the observed and the rendered crop, another one the two laid over each other. Exchange blocks
+(convolutions within a crop, attention across the two) tell every cell of one what the other shows, and the rendered
+cells also know where their surface lies in space. Matching all pairs of cells gives a first flow (GMFlow's way: Xu et
+al., 2022) and that a rigid motion; where this motion says that both crops show the same, a head at 1/4 resolution
+compares them and gives the fine flow with its uncertainty and visibility. The paper's heads stand on the rendered
+cells.
 """
 
 from __future__ import annotations
@@ -125,7 +126,7 @@ class Dense(nn.Module):
         self.out = nn.Conv2d(2 * width, 16, 1)  # four are used; fewer channels than 16 are slow or worse on the CPU
 
     def forward(self, observed: Tensor, rendered: Tensor, pair: Tensor, cells: Tensor, flow: Tensor) -> Tensor:
-        """observed, rendered, pair: (B, C, h, w) at 1/4. cells: (B, C, h/2, w/2), rendered. flow: (B, 2, h, w) in pixels.
+        """observed, rendered, pair: (B, C, h, w) at 1/4. cells: (B, C, h/2, w/2), rendered. flow: (B, 2, h, w), pixels.
         -> (B, 4, h, w): change of flow, log scale, visibility."""
         there = warp(self.look(observed), flow.detach() / ANCHOR)
         known = F.interpolate(self.know(cells), scale_factor=CELL / ANCHOR, mode="nearest")

@@ -120,8 +120,9 @@ def dense_loss(
     )
     seen = (near & target.visible).float()
     epe = ((prediction.flow - target.flow).detach().norm(dim=1) * seen).sum() / seen.sum().clamp_min(1.0)
-    parts = {"epe_px": epe, "match": match, "early": early, "rigid": rigids[-1], "rigid1": rigids[0], "likelihood": likelihood, "visibility": visibility, "rotation": rotation,
-             "translation": translation, "angle": angle}  # fmt: skip
+    parts = {"epe_px": epe, "match": match, "early": early, "rigid": rigids[-1], "rigid1": rigids[0],
+             "likelihood": likelihood, "visibility": visibility, "rotation": rotation, "translation": translation,
+             "angle": angle}  # fmt: skip
     return loss, {name: float(value.detach()) for name, value in parts.items()}
 
 
