@@ -17,10 +17,11 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from posekit.nets.heads import PoseHeads, Prediction, expand_angle
-from posekit.nets.rigid import Surface, induced_flow, solve_motion
+from posekit.nets.rigid import Motion, Surface, induced_flow, solve_motion
 
 CELL = 8  # pixels per cell
 ANCHOR = 4  # pixels per anchor of the dense head; the first anchor is pixel (2, 2)
+FACTS = 9  # see `facts_of`
 
 
 @dataclass(frozen=True)
@@ -100,17 +101,19 @@ class Exchange(nn.Module):
 
 
 class Summary(nn.Module):
-    """The cells of a whole crop as 256 numbers, for the paper's heads."""
+    """The cells of a whole crop, and ``facts`` numbers beside them, as 256 numbers for the paper's heads."""
 
-    def __init__(self, channels: int, size: tuple[int, int]) -> None:
+    def __init__(self, channels: int, size: tuple[int, int], facts: int = 0) -> None:
         super().__init__()
         h, w = size[1] // CELL, size[0] // CELL
         self.convs = nn.Sequential(nn.Conv2d(channels, 128, 3, 2, 1), nn.ReLU(), nn.Conv2d(128, 64, 3, 2, 1), nn.ReLU())
         cells = ((h + 3) // 4) * ((w + 3) // 4)
-        self.fc = nn.Sequential(nn.Linear(64 * cells, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU())
+        self.fc = nn.Sequential(nn.Linear(64 * cells + facts, 256), nn.ReLU(), nn.Linear(256, 256), nn.ReLU())
 
-    def forward(self, x: Tensor) -> Tensor:
-        return self.fc(self.convs(x).flatten(1))
+    def forward(self, x: Tensor, facts: Tensor | None = None) -> Tensor:
+        """x: (B, channels, h, w). facts: (B, facts)."""
+        seen = self.convs(x).flatten(1)
+        return self.fc(seen if facts is None else torch.cat([seen, facts.to(seen.dtype)], dim=1))
 
 
 class Dense(nn.Module):
@@ -188,7 +191,7 @@ class LiteSVNet(nn.Module):
         self.sharpness = nn.Parameter(torch.tensor([10.0, 10.0]))
         self.coarse = nn.Sequential(conv_bn(channels + 3, 128), nn.ReLU(), Residual(128, 128), nn.Conv2d(128, 16, 1))
         self.dense = Dense(config)
-        self.summary = Summary(channels + 4, config.size)
+        self.summary = Summary(channels + 4, config.size, FACTS)
         self.heads = PoseHeads(256, with_angle=True)
 
     def forward(self, observed: Tensor, rendered: Tensor, relief: Tensor, focal: Tensor) -> Prediction:
@@ -225,7 +228,8 @@ class LiteSVNet(nn.Module):
         rigid = [first_motion, induced_flow(surface, motion).mT.unflatten(2, on.shape[1:])]
         masks = F.avg_pool2d(torch.cat([observed[:, 3:], rendered[:, 3:]], dim=1), CELL)
         known = [cells, (better.detach() / CELL).to(cells.dtype), masks.to(cells.dtype)]
-        quat, v, angle = self.heads(self.summary(torch.cat(known, dim=1)))
+        facts = facts_of(motion, on, log_scale, dense[:, 3]).detach()
+        quat, v, angle = self.heads(self.summary(torch.cat(known, dim=1), facts))
         assert angle is not None
         prediction = Prediction(quat, v, expand_angle(angle), fine_flow, log_scale, dense[:, 3])
         return LiteOutput(prediction, [flow, better], rigid, angle, likenesses)
@@ -237,6 +241,17 @@ class LiteSVNet(nn.Module):
         weight = share * torch.exp(log_weight.clamp(-6.0, 6.0))
         motion = solve_motion(Surface.of(mean, focal, CELL, 3.5), points_of(flow), weight.flatten(1))
         return induced_flow(Surface.of(relief, focal, ANCHOR, 2.0), motion).mT.unflatten(2, on.shape[1:])
+
+
+def facts_of(motion: Motion, on: Tensor, log_scale: Tensor, visibility: Tensor) -> Tensor:
+    """What the dense answer says as a whole, (B, FACTS), of the size of 1: the motion's turn (axis times sine, cosine)
+    and shift, and over the object the mean log scale and visibility."""
+    R, t = motion.R, motion.t
+    turn = torch.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], dim=1)
+    cosine = 0.5 * (R.diagonal(dim1=1, dim2=2).sum(1, keepdim=True) - 1)
+    share = on / on.sum((1, 2), keepdim=True).clamp_min(1.0)
+    means = [(x * share).sum((1, 2))[:, None] for x in (log_scale, torch.sigmoid(visibility))]
+    return torch.cat([turn, 4 * (1 - cosine), (10 * t).clamp(-3, 3), *means], dim=1)
 
 
 def points_of(flow: Tensor) -> Tensor:
