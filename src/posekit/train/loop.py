@@ -28,6 +28,7 @@ from torch.utils.data import DataLoader, IterableDataset
 
 from posekit.errors import ConfigError, TrainingError
 from posekit.files import write_text_atomic
+from posekit.nets.precision import has_fast_bfloat16
 from posekit.train.checkpoint import Checkpoint, Checkpoints, optimiser_tensors, part, restore_optimiser
 from posekit.train.config import OptimiserConfig, TrainConfig
 from posekit.train.log import Curves
@@ -109,7 +110,9 @@ def make_fabric(config: TrainConfig) -> Any:
     accelerator = machine.accelerator
     if accelerator == "auto":
         accelerator = "cuda" if torch.cuda.is_available() else "cpu"
-    precision = _precision(accelerator) if machine.precision == "auto" else machine.precision
+    precision = machine.precision
+    if precision == "auto":
+        precision = "bf16-mixed" if has_fast_bfloat16(accelerator) else "32-true"
     several = config.world > 1 or TorchElasticEnvironment.detect()
     strategy = "ddp" if several else "auto"
     try:
@@ -124,16 +127,6 @@ def make_fabric(config: TrainConfig) -> Any:
     if machine.threads:
         torch.set_num_threads(machine.threads)
     return fabric
-
-
-def _precision(accelerator: str) -> str:
-    """bfloat16 where the hardware multiplies in it; on other CPUs it would be several times slower than float32."""
-    if accelerator == "cuda":
-        fast = torch.cuda.is_bf16_supported()
-    else:
-        ask: Any = getattr(torch.cpu, "get_capabilities", dict)  # older versions of torch do not tell
-        fast = bool(ask().get("amx_bf16"))
-    return "bf16-mixed" if fast else "32-true"
 
 
 def make_optimiser(nets: nn.Module, config: TrainConfig) -> torch.optim.Optimizer:
