@@ -30,7 +30,7 @@ from posekit.object_model import ObjectModel
 from posekit.refine import RefineOptions, refine
 from posekit.render import Renderer
 from posekit.train.config import changed, default_config
-from posekit.train.loop import Trainer, make_fabric
+from posekit.train.loop import Progress, Trainer, make_fabric
 from posekit.train.pose import make_task
 from posekit.train.sources import Sources
 
@@ -111,7 +111,7 @@ def main() -> None:
         trainer = Trainer(config, task, make_fabric(config), Path(folder) / "run")
         trainer.config = config
 
-        def show(progress: object) -> None:
+        def show(_: Progress) -> None:
             if trainer.step % args.every == 0:
                 task.export(trainer.average.module, Path(folder), {})
                 share = share_within_5(dataset, Path(folder))
