@@ -284,14 +284,17 @@ def bop_folder(root: Path, count: int = 4) -> Path:
         f"{vertices}\n{faces}\n"
     )
     rng = np.random.default_rng(0)
-    poses = [Pose(random_rotation(rng), np.array([0.0, 0.0, 0.5])) for _ in range(count)]
+    poses, boxes = [Pose(random_rotation(rng), np.array([0.0, 0.0, 0.5])) for _ in range(count)], {}
     for k, view in enumerate(Renderer().render(model, poses, camera)):
         assert view.mask is not None
+        x, y, w, h = cv2.boundingRect(view.mask.astype(np.uint8))
+        boxes[str(k)] = [{"bbox_obj": [x, y, w, h], "bbox_visib": [x, y, w, h], "visib_fract": 1.0}]
         cv2.imwrite(str(scene / "rgb" / f"{k:06d}.png"), view.image[..., ::-1])
         cv2.imwrite(str(scene / "mask_visib" / f"{k:06d}_000000.png"), view.mask.astype(np.uint8) * 255)
     truths = {str(k): [{"obj_id": 1, "cam_R_m2c": p.R.ravel().tolist(), "cam_t_m2c": (p.t * 1000).tolist()}]
               for k, p in enumerate(poses)}  # fmt: skip
     (scene / "scene_gt.json").write_text(json.dumps(truths))
+    (scene / "scene_gt_info.json").write_text(json.dumps(boxes))
     (scene / "scene_camera.json").write_text(json.dumps({k: {"cam_K": camera.K.ravel().tolist()} for k in truths}))
     return root
 
@@ -311,10 +314,16 @@ def test_the_papers_recipe_takes_an_encoder_a_validation_set_and_a_profile(tmp_p
     file, out = tmp_path / "a.toml", tmp_path / "mine"
     config = changed(PAPER, {"overfit": False, "cases": 2, "optimiser": {"rate": 1e-9}}, "here")
     file.write_text(write_config(config))
+    described = folder / "train" / "000001" / "scene_gt_info.json"
+    kept = described.read_text()
+    described.unlink()
     arguments = ["train", "pose", "--recipe", "paper", "--config", str(file), "--steps", "13", "--profile",
                  "--bop", f"{folder}:train=1", "--flownets", str(tmp_path / "flownets.safetensors"),
                  "--validate-on", str(folder), "--out", str(out)]  # fmt: skip
-    result = CliRunner().invoke(app, arguments)
+    refused = CliRunner().invoke(app, arguments)
+    assert refused.exit_code == 1 and "shows nothing to measure on" in refused.output
+    described.write_text(kept)
+    result = CliRunner().invoke(app, [*arguments, "--force"])
     assert result.exit_code == 0, result.output
     svnet = load_networks("paper", out).svnet
     assert isinstance(svnet, PaperSVNet)
