@@ -35,6 +35,8 @@ DOORS = {
     "lightning_fabric": {"train"},
     "typer": {"cli"},
     "rich": {"cli"},
+    "huggingface_hub": {"data"},
+    "pycocotools": {"evaluate"},
 }
 
 ROOM_LAYER = {room: layer for layer, rooms in LAYERS.items() for room in rooms}

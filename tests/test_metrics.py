@@ -118,3 +118,167 @@ def test_mssd_needs_the_hull_only() -> None:
     assert len(hull) < len(POINTS)
     for angle in (0.1, 1.0, 2.5):
         assert metrics.mssd(turned(angle), GT, hull) == pytest.approx(metrics.mssd(turned(angle), GT, POINTS))
+
+
+# --- vectorised forms against naive ones ----------------------------------------------------------------------------
+
+
+def random_poses(n: int, seed: int) -> list[Pose]:
+    rng = np.random.default_rng(seed)
+    return [Pose(random_rotation(rng), [*rng.normal(0, 0.05, 2), rng.uniform(0.6, 1.0)]) for _ in range(n)]
+
+
+def test_adds_against_all_distances() -> None:
+    estimated, truth = random_poses(5, 1), random_poses(5, 2)
+    naive = []
+    for e, t in zip(estimated, truth, strict=True):
+        apart = np.linalg.norm(t.apply(POINTS)[:, None] - e.apply(POINTS)[None], axis=-1)
+        naive.append(apart.min(axis=1).mean())
+    np.testing.assert_allclose(metrics.adds(estimated, truth, POINTS), naive, rtol=1e-9)
+
+
+@pytest.mark.parametrize("text", ["z:inf", "x:2,y:2", "z:5"])
+def test_the_search_of_symmetries_by_bounds_is_exact(text: str) -> None:
+    symmetries = Symmetries.parse(text, [0.01, 0, 0]).transforms(metrics.BOP_STEPS)
+    estimated, truth = random_poses(6, 3), random_poses(6, 4)
+    estimated[0] = truth[0] @ symmetries[-1] @ Pose.translation([0.001, 0.002, 0.003])
+    camera = Camera(500, 520, 310, 250, 640, 480)
+    naive = [
+        min(
+            np.linalg.norm(camera.project(e.apply(POINTS)) - camera.project((t @ s).apply(POINTS)), axis=1).max()
+            for s in symmetries
+        )
+        for e, t in zip(estimated, truth, strict=True)
+    ]
+    np.testing.assert_allclose(metrics.mspd(estimated, truth, camera, POINTS, symmetries), naive, rtol=1e-9)
+
+
+def test_each_pose_may_have_its_own_camera() -> None:
+    estimated, truth = random_poses(3, 5), random_poses(3, 6)
+    cameras = [Camera(400 + 50 * k, 410, 300, 200 + k, 640, 480) for k in range(3)]
+    K = np.stack([c.K for c in cameras])
+    for measure in (metrics.proj2d, metrics.mspd):
+        alone = [measure(e, t, c, POINTS) for e, t, c in zip(estimated, truth, cameras, strict=True)]
+        np.testing.assert_allclose(measure(estimated, truth, K, POINTS), alone, rtol=1e-12)
+
+
+def test_no_poses_give_no_errors() -> None:
+    none = np.zeros((0, 4, 4))
+    for values in (metrics.add(none, none, POINTS), metrics.mssd(none, none, POINTS), metrics.adds(none, none, POINTS)):
+        assert values.shape == (0,)
+
+
+def test_auc_is_the_area_under_accuracy_against_threshold() -> None:
+    errors = np.array([0.0, 0.02, 0.05, 0.3])
+    thresholds = np.linspace(0, 0.1, 100_001)
+    area = (errors[:, None] < thresholds).mean()
+    assert metrics.auc(errors).mean() == pytest.approx(area, abs=1e-4)
+    assert metrics.auc(errors).tolist() == pytest.approx([1.0, 0.8, 0.5, 0.0])
+
+
+# --- VSD -------------------------------------------------------------------------------------------------------------
+
+
+def depths(*columns: tuple[int, int, float]) -> np.ndarray:
+    """A 4 x 8 depth image with blocks of columns [a, b) at a depth."""
+    image = np.zeros((4, 8), np.float32)
+    for a, b, z in columns:
+        image[:, a:b] = z
+    return image
+
+
+FAR = Camera(1e6, 1e6, 3.5, 1.5, 8, 4)  # rays along z, so that distances are depths
+TAUS = np.linspace(0.05, 0.5, 10)
+
+
+def test_vsd_of_the_truth_is_zero() -> None:
+    gt = depths((1, 5, 1.0))
+    assert metrics.vsd(gt, gt, gt, FAR, 0.1, TAUS).tolist() == [0.0] * 10
+
+
+def test_vsd_counts_pixels_that_only_one_pose_covers() -> None:
+    gt, est = depths((1, 5, 1.0)), depths((3, 7, 1.0))
+    scene = depths((0, 8, 2.0))  # both are in front of what the sensor saw
+    np.testing.assert_allclose(metrics.vsd(est, gt, scene, FAR, 0.1, TAUS), 4 / 6)
+
+
+def test_vsd_counts_distances_against_the_tolerance() -> None:
+    gt, est = depths((1, 5, 1.0)), depths((1, 5, 1.012))
+    values = metrics.vsd(est, gt, depths(), FAR, 0.1, TAUS)
+    assert values.tolist() == [1.0, 1.0] + [0.0] * 8  # 12 mm of a diameter of 100 mm
+
+
+def test_vsd_leaves_out_what_is_hidden() -> None:
+    gt, est = depths((1, 5, 1.0)), depths((1, 7, 1.0))
+    scene = depths((0, 3, 0.5), (3, 5, 1.0), (5, 7, 0.5))  # something stands before columns 0-2 and 5-6
+    np.testing.assert_allclose(metrics.vsd(est, gt, scene, FAR, 0.1, TAUS), 0.0)
+    np.testing.assert_allclose(metrics.vsd(depths(), depths(), scene, FAR, 0.1, TAUS), 1.0)
+
+
+# --- matching, precision ---------------------------------------------------------------------------------------------
+
+
+def test_matching_is_greedy_by_score() -> None:
+    errors = [[1.0, 3.0], [0.5, 0.6], [9.0, 9.0]]
+    assert metrics.match(errors, [0.9, 0.8, 0.7], 5.0).tolist() == [0, 1, -1]
+    assert metrics.match(errors, [0.8, 0.9, 0.7], 5.0).tolist() == [1, 0, -1]
+    assert metrics.match(errors, [0.9, 0.8, 0.7], 0.6).tolist() == [-1, 0, -1]  # strictly below
+    assert metrics.match(np.zeros((2, 0)), [1, 2], 5.0).tolist() == [-1, -1]
+
+
+def test_average_precision_of_hand_made_cases() -> None:
+    assert metrics.average_precision([True, True], [0.9, 0.8], 2) == 1.0
+    assert metrics.average_precision([], [], 3) == 0.0
+    # right, wrong, right of 2: precision 1 up to recall 0.5 (51 of the levels), 2/3 beyond (50)
+    assert metrics.average_precision([True, True, False], [0.9, 0.7, 0.8], 2) == pytest.approx((51 + 50 * 2 / 3) / 101)
+
+
+def test_box_iou() -> None:
+    boxes = [(0, 0, 2, 2), (1, 0, 3, 2), (5, 5, 6, 6)]
+    iou = metrics.box_iou(boxes[:1], boxes)
+    np.testing.assert_allclose(iou, [[1, 1 / 3, 0]])
+
+
+def test_coco_ap_equals_pycocotools() -> None:
+    from contextlib import redirect_stdout
+    from io import StringIO
+
+    from pycocotools.coco import COCO
+    from pycocotools.cocoeval import COCOeval
+
+    rng = np.random.default_rng(3)
+    annotations, results, pictures = [], [], []
+    for image in range(12):
+        true = [np.r_[xy, xy + rng.uniform(10, 40, 2)] for xy in rng.uniform(0, 100, (rng.integers(0, 5), 2))]
+        found = [t + rng.normal(0, 3, 4) for t in true for _ in range(rng.integers(0, 3))]
+        found += [np.r_[xy, xy + 20] for xy in rng.uniform(0, 100, (2, 2))]
+        scores = rng.random(len(found))
+        for t in true:
+            annotations.append({"id": len(annotations) + 1, "image_id": image, "category_id": 1, "iscrowd": 0,
+                                "bbox": [*t[:2], *(t[2:] - t[:2])], "area": float(np.prod(t[2:] - t[:2]))})  # fmt: skip
+        for f, s in zip(found, scores, strict=True):
+            results.append({"image_id": image, "category_id": 1, "bbox": [*f[:2], *(f[2:] - f[:2])], "score": s})
+        pictures.append((true, found, scores))
+    with redirect_stdout(StringIO()):
+        coco = COCO()
+        coco.dataset = {"images": [{"id": k} for k in range(12)], "annotations": annotations,
+                        "categories": [{"id": 1}], "info": {}}  # fmt: skip
+        coco.createIndex()
+        judge = COCOeval(coco, coco.loadRes(results), "bbox")
+        judge.evaluate()
+        judge.accumulate()
+        judge.summarize()
+    truths = [metrics.Regions(np.zeros(0), np.zeros(len(t), bool)) for t, _, _ in pictures]
+    detections = [metrics.Regions(s, np.zeros(0, bool)) for _, _, s in pictures]
+    overlaps = [metrics.box_iou(f, t) for t, f, _ in pictures]
+    assert 0.1 < judge.stats[0] < 0.9
+    assert metrics.coco_ap(truths, detections, overlaps) == pytest.approx(judge.stats[0], abs=1e-9)
+
+
+def test_coco_ap_neither_asks_for_nor_holds_against_what_is_ignored() -> None:
+    truths = [metrics.Regions(np.zeros(0), np.array([False, True]))]
+    found = [metrics.Regions(np.array([0.9, 0.8]), np.zeros(0, bool))]
+    assert metrics.coco_ap(truths, found, [np.array([[0.0, 1.0], [1.0, 0.0]])]) == 1.0
+    assert metrics.coco_ap(truths, found, [np.array([[0.0, 0.0], [1.0, 0.0]])]) == pytest.approx(0.5)
+    nothing = [metrics.Regions(np.zeros(0), np.array([True]))]
+    assert np.isnan(metrics.coco_ap(nothing, found, [np.zeros((2, 1))]))

@@ -7,20 +7,26 @@ One pose gives a number, N poses give (N,). Symmetries are transforms ``T_obj_ob
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from posekit.camera import Camera
-from posekit.geometry import Pose, rotation_angle
+from posekit.geometry import Pose, fibonacci_sphere, rotation_angle
 
 Array = NDArray[np.float64]
+Depth = NDArray[np.floating]
 Poses = Pose | Sequence[Pose] | ArrayLike
+Cameras = Camera | ArrayLike  # one for all poses, or matrices (3, 3) or (N, 3, 3)
 
 BOP_STEPS = 315  # turns that BOP makes of a continuous symmetry: Symmetries.transforms(BOP_STEPS)
+COCO_IOU = tuple(float(v) for v in np.linspace(0.5, 0.95, 10))
+COCO_MOST = 100  # detections per picture and class
 _ALONE = (Pose.identity(),)
+_CHUNK = 60_000  # distances that are computed at a time
 
 
 def pose_error(estimated: Poses, truth: Poses, symmetries: Sequence[Pose] = _ALONE) -> tuple[Array, Array]:
@@ -61,23 +67,39 @@ def within(rotation: ArrayLike, translation: ArrayLike, degrees: float, centimet
 
 def add(estimated: Poses, truth: Poses, points: ArrayLike) -> Array:
     """ADD: the mean distance of corresponding points, metres. points: (P, 3) of the model, metres."""
-    return _distances(_moved(estimated, points), _moved(truth, points)).mean(axis=-1)[()]
+    est, gt = np.broadcast_arrays(_matrices(estimated), _matrices(truth))
+    return _by_chunk(lambda e, g: _separations(_apart(e, g), points).mean(axis=-1), len(np.asarray(points)), est, gt)
 
 
 def adds(estimated: Poses, truth: Poses, points: ArrayLike) -> Array:
-    """ADD-S (ADI): the mean distance from each true point to the nearest estimated one, metres."""
+    """ADD-S (ADI): the mean distance from each true point to the nearest estimated one, metres.
+
+    A rigid motion keeps distances: the true points are brought into the estimated object's frame, whose points then
+    need one search tree for all poses.
+    """
+    cloud = np.asarray(points, dtype=np.float64)
+    tree = cKDTree(cloud, leafsize=32)
     est, gt = np.broadcast_arrays(_matrices(estimated), _matrices(truth))
-    results = [
-        cKDTree(_moved(e, points)).query(_moved(g, points))[0].mean()
-        for e, g in zip(est.reshape(-1, 4, 4), gt.reshape(-1, 4, 4), strict=True)
-    ]
-    return np.array(results).reshape(est.shape[:-2])[()]
+    between = _inverse(est) @ gt
+    return _by_chunk(lambda T: tree.query(_moved(T, cloud), workers=-1)[0].mean(axis=-1), len(cloud), between)
 
 
-def proj2d(estimated: Poses, truth: Poses, camera: Camera, points: ArrayLike) -> Array:
+def auc(errors: ArrayLike, limit: float = 0.1) -> Array:
+    """Each error's share of the area under the curve of accuracy against threshold, from 0 to ``limit`` (metres).
+
+    The mean over all instances is the area itself, exactly, in [0, 1]: PoseCNN's AUC of ADD and ADD-S up to 10 cm.
+    """
+    return np.clip(1.0 - np.asarray(errors, dtype=np.float64) / limit, 0.0, 1.0)[()]
+
+
+def proj2d(estimated: Poses, truth: Poses, camera: Cameras, points: ArrayLike) -> Array:
     """The mean distance of corresponding points in the picture, pixels."""
-    est, gt = (camera.project(_moved(poses, points)) for poses in (estimated, truth))
-    return _distances(est, gt).mean(axis=-1)[()]
+    est, gt, K = _with_cameras(estimated, truth, camera)
+
+    def mean(e: Array, g: Array, k: Array) -> Array:
+        return _distances(_projected(e, k, points), _projected(g, k, points)).mean(axis=-1)
+
+    return _by_chunk(mean, len(np.asarray(points)), est, gt, K)
 
 
 def mssd(estimated: Poses, truth: Poses, points: ArrayLike, symmetries: Sequence[Pose] = _ALONE) -> Array:
@@ -86,18 +108,212 @@ def mssd(estimated: Poses, truth: Poses, points: ArrayLike, symmetries: Sequence
     points: (P, 3); the convex hull's corners (`ObjectModel.outline`) give the same result as all vertices, because
     the distance is a convex function of the point.
     """
-    est, gt = _moved(estimated, points), _matrices(truth)
-    errors = [_distances(est, _moved(gt @ s.matrix, points)).max(axis=-1) for s in symmetries]
-    return _least(errors)
+    est, gt = np.broadcast_arrays(_matrices(estimated), _matrices(truth))
+    S = _matrices(symmetries)
+
+    def least(e: Array, g: Array) -> Array:
+        return _separations(_apart(e[:, None], g[:, None] @ S), points).max(axis=-1).min(axis=-1)
+
+    return _by_chunk(least, len(np.asarray(points)) * len(S), est, gt)
 
 
 def mspd(
-    estimated: Poses, truth: Poses, camera: Camera, points: ArrayLike, symmetries: Sequence[Pose] = _ALONE
+    estimated: Poses, truth: Poses, camera: Cameras, points: ArrayLike, symmetries: Sequence[Pose] = _ALONE
 ) -> Array:
-    """BOP's maximum symmetry-aware projection distance, pixels. points: (P, 3), all vertices."""
-    est, gt = camera.project(_moved(estimated, points)), _matrices(truth)
-    errors = [_distances(est, camera.project(_moved(gt @ s.matrix, points))).max(axis=-1) for s in symmetries]
-    return _least(errors)
+    """BOP's maximum symmetry-aware projection distance, pixels. points: (P, 3), all vertices.
+
+    Many symmetries are searched by bounds: over a few extreme points the largest distance is at most that over all,
+    so a symmetry whose bound is above the best result so far need not be looked at. The result is exact.
+    """
+    est, gt, K = _with_cameras(estimated, truth, camera)
+    cloud, S = np.asarray(points, dtype=np.float64), _matrices(symmetries)
+    few = cloud[_extremes(cloud)]
+
+    def full(e: Array, g: Array, k: Array) -> Array:
+        return _distances(_projected(e, k, cloud), _projected(g, k, cloud)).max(axis=-1)
+
+    def bounds(e: Array, g: Array, k: Array) -> Array:
+        there = _projected(g[:, None] @ S, k[:, None], few)
+        return _distances(_projected(e, k, few)[:, None], there).max(axis=-1)
+
+    if len(S) == 1:
+        return _by_chunk(lambda e, g, k: full(e, g @ S[0], k), len(cloud), est, gt, K)
+
+    def least(e: Array, g: Array, k: Array) -> Array:
+        bound = bounds(e, g, k)
+        order = bound.argsort(axis=1)
+        best = np.full(len(e), np.inf)
+        for rank in range(len(S)):
+            nth = order[:, rank]
+            open_ = np.flatnonzero(np.take_along_axis(bound, nth[:, None], axis=1)[:, 0] < best)
+            if not open_.size:
+                break
+            found = full(e[open_], g[open_] @ S[nth[open_]], k[open_])
+            best[open_] = np.minimum(best[open_], found)
+        return best
+
+    return _by_chunk(least, max(len(cloud), len(few) * len(S)), est, gt, K)
+
+
+def vsd(
+    depth_estimated: Depth,
+    depth_truth: Depth,
+    depth_scene: Depth,
+    camera: Camera,
+    diameter: float,
+    taus: ArrayLike,
+    delta: float = 0.015,
+) -> Array:
+    """BOP's visible surface discrepancy for each misalignment tolerance, in [0, 1], (T,).
+
+    Depths (H, W), metres along z, 0 where nothing is: the object rendered at the two poses, and the sensor's.
+    taus: (T,) shares of the diameter. delta: metres, tolerance of the visibility test. As the BOP challenge has it
+    since 2019: a surface is visible where the sensor saw nothing.
+    """
+    rays = np.linalg.norm(camera.backproject(camera.pixel_grid()), axis=-1)
+    est, gt, scene = (np.asarray(d, dtype=np.float64) * rays for d in (depth_estimated, depth_truth, depth_scene))
+    seen_gt = (gt > 0) & ((gt - scene <= delta) | (scene == 0))
+    seen_est = (est > 0) & ((est - scene <= delta) | (scene == 0) | seen_gt)
+    both, either = seen_gt & seen_est, int((seen_gt | seen_est).sum())
+    levels = np.asarray(taus, dtype=np.float64)
+    if not either:
+        return np.ones(len(levels))
+    apart = np.sort(np.abs(gt[both] - est[both]) / diameter)
+    wrong = len(apart) - np.searchsorted(apart, levels, side="left")  # as many as are at least tau apart
+    return np.asarray((wrong + either - len(apart)) / either)
+
+
+# --- which estimate belongs to which truth, recall and precision -----------------------------------------------------
+
+
+def match(errors: ArrayLike, scores: ArrayLike, threshold: float) -> NDArray[np.int64]:
+    """BOP's greedy matching: the estimates by falling score, each to the free truth with the least error below the
+    threshold. errors: (E, G); scores: (E,). Returns each estimate's truth, (E,), -1 where it has none."""
+    left = np.array(errors, dtype=np.float64)
+    matched = np.full(len(left), -1)
+    for e in np.argsort(-np.asarray(scores, dtype=np.float64), kind="stable"):
+        if left.shape[1] and left[e].min() < threshold:
+            matched[e] = left[e].argmin()
+            left[:, matched[e]] = np.inf
+    return matched
+
+
+def average_precision(hits: ArrayLike, scores: ArrayLike, total: int) -> float:
+    """Precision averaged over 101 levels of recall, as COCO and BOP'24 do. hits: (E,) whether an estimate is right;
+    total: how many there are to be found, at least 1."""
+    right = np.asarray(hits, dtype=np.bool_)[np.argsort(-np.asarray(scores, dtype=np.float64), kind="stable")]
+    found = np.cumsum(right)
+    precision = np.maximum.accumulate((found / np.arange(1, len(found) + 1))[::-1])[::-1]
+    first = np.searchsorted(found / total, np.linspace(0, 1, 101), side="left")
+    return float(np.append(precision, 0.0)[first].mean())
+
+
+def coco_ap(truths: Sequence[Regions], found: Sequence[Regions], overlaps: Sequence[Array]) -> float:
+    """COCO's AP of one class: the mean over IoU 0.50, 0.55, ..., 0.95. Each argument has one entry per picture.
+
+    overlaps: IoU (D, G) of detections and truths, of boxes (`box_iou`) or of masks.
+    NaN where there is nothing to be found.
+    """
+    total = sum(int((~t.ignored).sum()) for t in truths)
+    if not total:
+        return float("nan")
+    levels = []
+    for threshold in COCO_IOU:
+        hits, scores = [], []
+        for truth, here, iou in zip(truths, found, overlaps, strict=True):
+            order = np.argsort(-here.scores, kind="stable")[:COCO_MOST]
+            hit, ignore = _coco_match(iou[order], truth.ignored, threshold)
+            hits.append(hit[~ignore])
+            scores.append(here.scores[order][~ignore])
+        levels.append(average_precision(np.concatenate(hits), np.concatenate(scores), total))
+    return float(np.mean(levels))
+
+
+@dataclass(frozen=True, eq=False)
+class Regions:
+    """Boxes or masks of one class in one picture. scores: (N,) of detections. ignored: (N,) of truths, which count
+    neither as found nor as missed."""
+
+    scores: Array
+    ignored: NDArray[np.bool_]
+
+
+def box_iou(a: ArrayLike, b: ArrayLike) -> Array:
+    """Intersection over union (A, B) of boxes (A, 4) and (B, 4), edges."""
+    first, second = np.asarray(a, dtype=np.float64).reshape(-1, 4), np.asarray(b, dtype=np.float64).reshape(-1, 4)
+    low = np.maximum(first[:, None, :2], second[None, :, :2])
+    high = np.minimum(first[:, None, 2:], second[None, :, 2:])
+    common = np.clip(high - low, 0, None).prod(axis=-1)
+    area_a, area_b = ((x[:, 2:] - x[:, :2]).prod(axis=-1) for x in (first, second))
+    union = area_a[:, None] + area_b - common
+    return np.asarray(np.divide(common, union, out=np.zeros_like(common), where=union > 0))
+
+
+def _coco_match(
+    iou: Array, ignored: NDArray[np.bool_], threshold: float
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which detections (sorted by score) hit a truth, and which are to be ignored."""
+    hit, ignore = np.zeros(len(iou), dtype=np.bool_), np.zeros(len(iou), dtype=np.bool_)
+    free = np.ones(len(ignored), dtype=np.bool_)
+    for d, overlap in enumerate(iou):
+        usable = free & (overlap >= min(threshold, 1 - 1e-10))
+        real = usable & ~ignored
+        chosen = real if real.any() else usable
+        if chosen.any():
+            g = int(np.where(chosen, overlap, -1.0).argmax())
+            free[g] = False
+            hit[d], ignore[d] = not ignored[g], ignored[g]
+    return hit, ignore
+
+
+# --- inside ----------------------------------------------------------------------------------------------------------
+
+
+def _by_chunk(measure: Callable[..., Array], width: int, *arrays: Array) -> Array:
+    """``measure`` over the leading axes of arrays (..., 4, 4) or (..., 3, 3), in portions that suit the caches."""
+    lead = arrays[0].shape[:-2]
+    flat = [a.reshape(-1, *a.shape[-2:]) for a in arrays]
+    step = max(1, _CHUNK // max(1, width))
+    parts = [measure(*(a[k : k + step] for a in flat)) for k in range(0, len(flat[0]), step)]
+    return np.concatenate([np.zeros(0), *parts]).reshape(lead)[()]
+
+
+def _inverse(T: Array) -> Array:
+    """Inverse rigid transforms (..., 4, 4)."""
+    out = np.zeros_like(T)
+    out[..., :3, :3] = np.swapaxes(T[..., :3, :3], -1, -2)
+    out[..., :3, 3] = -np.einsum("...ij,...j->...i", out[..., :3, :3], T[..., :3, 3])
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def _apart(est: Array, gt: Array) -> Array:
+    """(..., 3, 4) A with ``A @ (p, 1)`` the vector from a point's true to its estimated place."""
+    return np.asarray((est - gt)[..., :3, :])
+
+
+def _separations(apart: Array, points: ArrayLike) -> Array:
+    """The length of ``A @ (p, 1)`` for all A (..., 3, 4) and points (P, 3), (..., P)."""
+    cloud = np.asarray(points, dtype=np.float64)
+    vectors = cloud @ np.swapaxes(apart[..., :3], -1, -2) + apart[..., None, :, 3]
+    return np.asarray(np.sqrt(np.einsum("...i,...i->...", vectors, vectors)))
+
+
+def _projected(T: Array, K: Array, points: ArrayLike) -> Array:
+    """Pixels (..., P, 2) of points (P, 3) at poses (..., 4, 4) in cameras (..., 3, 3)."""
+    image = _moved(K @ T[..., :3, :], points)
+    return np.asarray(image[..., :2] / image[..., 2:])
+
+
+def _with_cameras(estimated: Poses, truth: Poses, camera: Cameras) -> tuple[Array, Array, Array]:
+    K = camera.K if isinstance(camera, Camera) else np.asarray(camera, dtype=np.float64)
+    est, gt = np.broadcast_arrays(_matrices(estimated), _matrices(truth))
+    return est, gt, np.broadcast_to(K, (*est.shape[:-2], 3, 3))
+
+
+def _extremes(points: Array) -> NDArray[np.int64]:
+    """Indices of the points that are outermost in some of 60 directions."""
+    return np.unique((points @ fibonacci_sphere(60).T).argmax(axis=0))
 
 
 def _matrices(poses: Poses) -> Array:
@@ -113,14 +329,10 @@ def _matrices(poses: Poses) -> Array:
 
 
 def _moved(poses: Poses, points: ArrayLike) -> Array:
-    """Points (P, 3) moved by each pose, (..., P, 3)."""
-    T = _matrices(poses)
+    """Points (P, 3) moved by each pose, or by each matrix (..., 3, 4), (..., P, 3)."""
+    T = poses if isinstance(poses, np.ndarray) else _matrices(poses)
     moved = np.asarray(points, dtype=np.float64) @ np.swapaxes(T[..., :3, :3], -1, -2)
     return np.asarray(moved + T[..., None, :3, 3])
-
-
-def _least(errors: list[Array]) -> Array:
-    return np.asarray(np.min(errors, axis=0))[()]
 
 
 def _distances(a: Array, b: Array) -> Array:

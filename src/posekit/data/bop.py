@@ -10,11 +10,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+import PIL.Image
 from numpy.typing import NDArray
 
 from posekit.camera import Box, Camera
-from posekit.errors import CameraError, InputError, MeshError
+from posekit.errors import CameraError, ImageError, InputError, MeshError
 from posekit.geometry import Pose
 from posekit.load import load_image, load_mask, pose_from_bop
 from posekit.object_model import ObjectModel
@@ -50,6 +52,14 @@ class Instance:
 
 
 @dataclass(frozen=True, eq=False)
+class MeasuredModel:
+    """An object as errors are measured with it. diameter: metres, as models_info.json has it, where it does."""
+
+    model: ObjectModel
+    diameter: float
+
+
+@dataclass(frozen=True, eq=False)
 class Target:
     """What a test asks for: ``count`` instances of an object in an image."""
 
@@ -70,7 +80,7 @@ class BopDataset:
     def __init__(
         self, root: str | Path, split: str = "test", targets: str | None = "auto", models: str = "models"
     ) -> None:
-        self.root, self.split = Path(root), split
+        self.root, self.split, self.name = Path(root), split, Path(root).resolve().name
         if not (self.root / split).is_dir():
             raise InputError(
                 f"{self.root} has no folder {split!r}: a data set in BOP layout has models/ and {split}/000001/ and so "
@@ -79,6 +89,7 @@ class BopDataset:
         self._models = self.root / models
         self._targets_file = self._find_targets(targets)
         self._loaded: dict[int, ObjectModel] = {}
+        self._measured: dict[int, MeasuredModel] = {}
         self._scenes: dict[int, _Scene] = {}
 
     # --- what there is ---
@@ -98,6 +109,15 @@ class BopDataset:
                 raise MeshError(f"there is no mesh {path} for object {obj_id}; there are {self.model_ids()}.")
             self._loaded[obj_id] = ObjectModel.load(path, units="mm")
         return self._loaded[obj_id]
+
+    def measured_model(self, obj_id: int) -> MeasuredModel:
+        """What an object's errors are measured with: the mesh in models_eval/ where there is one, as BOP does."""
+        if obj_id not in self._measured:
+            fine = self.root / "models_eval" / f"obj_{obj_id:06d}.ply"
+            model = ObjectModel.load(fine, units="mm") if fine.is_file() else self.model(obj_id)
+            folder = fine.parent if fine.is_file() else self._models
+            self._measured[obj_id] = MeasuredModel(model, _diameter(folder / "models_info.json", obj_id, model))
+        return self._measured[obj_id]
 
     def scenes(self) -> list[int]:
         """The scenes' numbers."""
@@ -141,6 +161,28 @@ class BopDataset:
                 f"there is no photograph {candidates[0]}: image {image} of scene {scene} is not in this copy."
             )
         return found
+
+    def picture_size(self, scene: int, image: int) -> tuple[int, int]:
+        """A photograph's (width, height), from its header."""
+        path = self.image_path(scene, image)
+        try:
+            with PIL.Image.open(path) as picture:
+                return picture.size
+        except OSError as error:
+            raise ImageError(f"the picture {path} is damaged ({error}): make or copy it again.") from error
+
+    def depth(self, scene: int, image: int) -> NDArray[np.float32] | None:
+        """The sensor's depth (H, W), metres, 0 where it saw nothing; None where the data set has none."""
+        here = self._scene(scene)
+        candidates = [here.folder / "depth" / f"{image:06d}{suffix}" for suffix in (".png", ".tif")]
+        path = next((candidate for candidate in candidates if candidate.is_file()), None)
+        if path is None:
+            return None
+        raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if raw is None or raw.ndim != 2:
+            raise ImageError(f"the depth image {path} is damaged or has several channels: copy it again.")
+        scale = float(here.cameras.get(image, {}).get("depth_scale", 1.0))
+        return np.asarray(raw, dtype=np.float32) * np.float32(scale / 1000.0)
 
     def camera(self, scene: int, image: int, size: tuple[int, int]) -> Camera:
         """A photograph's camera; size: (width, height). Raises CameraError."""
@@ -248,6 +290,20 @@ def _box(xywh: Any) -> Box | None:
     """
     x, y, w, h = (float(v) for v in xywh)
     return (x, y, x + w + 1, y + h + 1) if w >= 0 and h >= 0 else None
+
+
+def _diameter(info: Path, obj_id: int, model: ObjectModel) -> float:
+    """As the data set states it, else measured. Raises InputError where what is stated is no length."""
+    entry = _json(info).get(str(obj_id), {}) if info.is_file() else {}
+    if "diameter" not in entry:
+        return model.diameter
+    try:
+        diameter = float(entry["diameter"]) / 1000.0
+    except (TypeError, ValueError):
+        diameter = math.nan
+    if not 0 < diameter < math.inf:
+        raise InputError(f"{info} gives object {obj_id} the diameter {entry['diameter']!r}: it is a number of mm.")
+    return diameter
 
 
 def _json(path: Path) -> Any:

@@ -175,7 +175,7 @@ def _trimmed(counts: NDArray[np.int64]) -> list[int]:
 
 def _check(picture: Picture) -> None:
     size = (picture.camera.height, picture.camera.width)
-    arrays = [picture.image, *(m for a in picture.annotations for m in (a.mask, a.mask_visib))]
+    arrays: list[NDArray[Any]] = [picture.image, *(m for a in picture.annotations for m in (a.mask, a.mask_visib))]
     arrays += [] if picture.depth is None else [picture.depth]
     if any(array.shape[:2] != size for array in arrays):
         raise InputError(f"a picture's arrays have shapes {[a.shape for a in arrays]}, its camera {size}.")
@@ -230,7 +230,8 @@ def _bop_box(box: Box | None) -> list[int]:
 
 def _coco(images: Mapping[int, Any], objects: Mapping[int, str], suffix: str, description: str) -> dict[str, Any]:
     """A scene's visible masks as a COCO data set."""
-    pictures, annotations = [], []
+    pictures: list[dict[str, Any]] = []
+    annotations: list[dict[str, Any]] = []
     for image, record in images.items():
         width, height = record["camera"]["width"], record["camera"]["height"]
         pictures.append({"id": image, "file_name": f"rgb/{image:06d}.{suffix}", "width": width, "height": height})

@@ -1,0 +1,27 @@
+"""``posekit download``: a BOP data set."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def download(
+    name: Annotated[str, typer.Argument(help="lmo, lm, linemod, ycbv, tless, tudl, icbin, itodd, hb, ...")],
+    root: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder of all data sets; else $POSEKIT_DATA, else the cache.")
+    ] = None,
+    keep: Annotated[bool, typer.Option("--keep", help="Keep the archives.")] = False,
+) -> None:
+    """Fetch a data set in BOP layout; a download that was interrupted goes on where it stopped."""
+    from posekit.data.datasets import data_folder, dataset_info
+    from posekit.data.download import download as fetch
+
+    info = dataset_info(name)
+    folder = data_folder() if root is None else root
+    typer.echo(f"{info.title}: {', '.join(info.archives)} into {folder / info.below}")
+    fetched = fetch(info, folder, keep=keep)
+    new = f"fetched {', '.join(fetched.archives)}" if fetched.archives else "all archives were there"
+    typer.echo(f"{fetched.folder}: {new}")

@@ -1,0 +1,77 @@
+"""What an evaluation is asked to do."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from posekit.errors import ConfigError
+from posekit.estimate import EstimateOptions
+from posekit.geometry import PoseNoise
+
+STAGES = ("refine", "estimate", "score")
+DETECTIONS = ("gt-boxes", "gt-masks")
+MASKS = ("true", "none")
+NOT_RESULTS = ("workers",)  # what may differ between two runs of the same results
+
+
+@dataclass(frozen=True)
+class EvalOptions:
+    """dataset: a known name, or None. root: its folder. objects: numbers, all where empty. images: (scene, image),
+    all where empty. limit: that many pictures, spread evenly. min_visible: instances at least as visible, in [0, 1];
+    None is the test's own targets. detections: one of DETECTIONS or a JSON file. masks: whether the refiner is given
+    the visible mask. noise: degrees and three cm, standard deviations. threads: of torch, in each worker; the same
+    whatever the number of workers, since sums depend on it. The rest is EstimateOptions'."""
+
+    stage: str
+    dataset: str | None = None
+    root: Path | None = None
+    split: str | None = None
+    objects: tuple[int, ...] = ()
+    images: tuple[tuple[int, int], ...] = ()
+    limit: int | None = None
+    min_visible: float | None = None
+    detections: str = "gt-masks"
+    masks: str = "true"
+    noise: tuple[float, float, float, float] = (15.0, 1.0, 1.0, 5.0)
+    preset: str = "lite"
+    weights: Path | None = None
+    estimate: EstimateOptions = EstimateOptions()
+    threads: int = 1
+    workers: int = 1
+
+    def __post_init__(self) -> None:
+        if self.stage not in STAGES:
+            raise ConfigError(f"the stage is one of {', '.join(STAGES)}, not {self.stage!r}.")
+        if self.min_visible is not None and not 0 <= self.min_visible <= 1:
+            raise ConfigError(f"the least visible share is between 0 and 1, not {self.min_visible:g}.")
+        if self.masks not in MASKS:
+            raise ConfigError(f"the refiner's masks are one of {', '.join(MASKS)}, not {self.masks!r}.")
+        if self.limit is not None and self.limit < 1:
+            raise ConfigError(f"at least 1 picture is needed, not {self.limit}.")
+        if self.workers < 1 or self.threads < 1:
+            raise ConfigError(f"at least 1 worker and 1 thread are needed, not {self.workers} and {self.threads}.")
+        if len(self.noise) != 4 or min(self.noise) < 0:
+            raise ConfigError(f"the noise is four numbers from 0 on, degrees and x, y, z in cm, not {self.noise}.")
+        if self.detections not in DETECTIONS and not Path(self.detections).is_file():
+            raise ConfigError(
+                f"detections are {', '.join(DETECTIONS)} or a JSON file; there is no file {self.detections!r}."
+            )
+
+    @property
+    def pose_noise(self) -> PoseNoise:
+        """DeepIM's: rotations of more than three standard deviations (45 degrees) are drawn again."""
+        degrees, x, y, z = self.noise
+        return PoseNoise(degrees, 3 * degrees, (x / 100, y / 100, z / 100))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        values = dataclasses.asdict(self)
+        return {k: str(v) if isinstance(v, Path) else v for k, v in values.items()}
+
+    def identity(self) -> dict[str, Any]:
+        """What decides the results."""
+        values = {k: v for k, v in self.as_dict().items() if k not in NOT_RESULTS}
+        return values | {"root": None if self.root is None else str(self.root.resolve())}

@@ -1,0 +1,191 @@
+"""What is done with one picture: refine from disturbed truth, or estimate from detections.
+
+A picture's record is plain JSON, so that it can be kept, and is the same whatever was computed before it: random
+numbers come from a seed of the instance's own.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from posekit.camera import mask_box
+from posekit.data.datasets import open_dataset
+from posekit.detect import BoxPrompt
+from posekit.detect.prompts import clip_box
+from posekit.errors import ConfigError, PromptError
+from posekit.estimate import PoseEstimator
+from posekit.evaluate.bop_results import FoundRegion, read_detections
+from posekit.evaluate.options import DETECTIONS, EvalOptions
+from posekit.evaluate.truths import Truth, TruthReader, selected
+from posekit.geometry import Pose
+from posekit.metrics import box_iou
+from posekit.results import Detection, Estimate
+from posekit.view import View
+
+Record = dict[str, Any]
+IGNORED_BELOW = 0.1  # visible share below which BOP's detection measures ignore a truth
+
+
+class ImageStage:
+    """Runs a stage on pictures, one after the other; one object in each worker."""
+
+    def __init__(self, options: EvalOptions) -> None:
+        self.options = options
+        self.data, self.info = open_dataset(options.dataset, options.root, options.split)
+        self.truths = TruthReader(self.data)
+        self._estimators: dict[int, PoseEstimator] = {}
+        self._files: Mapping[tuple[int, int], Sequence[FoundRegion]] = {}
+        if options.stage == "estimate" and options.detections not in DETECTIONS:
+            self._files = detections_for(self.data, options)
+
+    def run(self, scene: int, image: int) -> Record:
+        """A picture's record: truths, estimates, and how detections overlap with truths."""
+        truths = self.truths.read(scene, image)
+        chosen = selected(self.data, truths, scene, image, self.options)
+        record: Record = {"scene": scene, "image": image, "truths": [_truth(t, chosen) for t in truths]}
+        view = self.data.view(scene, image) if chosen or (scene, image) in self._files else None
+        record["estimates"] = [] if view is None else self._estimates(view, truths, chosen)
+        if self._files:
+            record["detections"] = overlaps(self._files.get((scene, image), ()), truths)
+        return record
+
+    def _estimates(self, view: View, truths: list[Truth], chosen: list[Truth]) -> list[Record]:
+        if self.options.stage == "refine":
+            return [self._refined(view, truth) for truth in chosen]
+        if self.options.detections in DETECTIONS:
+            found = [self._from_truth(view, truth) for truth in chosen]
+            return [entry for entry in found if entry is not None]
+        scene, image = truths[0].instance.scene, truths[0].instance.image
+        return self._from_file(view, self._files.get((scene, image), ()))
+
+    def _refined(self, view: View, truth: Truth) -> Record:
+        instance, estimator = truth.instance, self._estimator(truth.instance.obj_id)
+        start = disturbed(truth, estimator, self.options)
+        mask = truth.read_mask() if self.options.masks == "true" else None
+        estimate = estimator.refine(view.with_mask(mask), start)
+        return _entry(estimate, instance.obj_id, instance.index) | {"start": start.matrix.tolist()}
+
+    def _from_truth(self, view: View, truth: Truth) -> Record | None:
+        """From an instance's own box or mask; None where nothing of it is seen, or no pose was found."""
+        estimator, mask = self._estimator(truth.instance.obj_id), truth.read_mask()
+        if self.options.detections == "gt-masks":
+            box = mask_box(mask)
+            detections = [] if box is None else [Detection(box, mask, 1.0, estimator.model.name, "mask")]
+        else:
+            detections = _prompted(view, truth.box_visib, estimator)
+        found = estimator.estimate(view, detections)
+        return _entry(found[0], truth.instance.obj_id, truth.instance.index) if found else None
+
+    def _from_file(self, view: View, regions: Sequence[FoundRegion]) -> list[Record]:
+        entries = []
+        for region in regions:
+            if self.options.objects and region.obj_id not in self.options.objects:
+                continue
+            estimator, mask = self._estimator(region.obj_id), region.mask()
+            if mask is not None and mask.shape != view.image.shape[:2]:
+                raise ConfigError(
+                    f"{self.options.detections}: a mask of scene {region.scene}, image {region.image} is "
+                    f"{mask.shape[1]}x{mask.shape[0]}, the picture {view.camera.width}x{view.camera.height}."
+                )
+            if mask is not None:
+                detections = [Detection(region.box, mask, region.score, estimator.model.name, "file")]
+            else:
+                detections = _prompted(view, region.box, estimator)
+            for estimate in estimator.estimate(view, detections):
+                entry = _entry(estimate, region.obj_id, None)
+                entries.append(entry | {"score": region.score * estimate.score, "detection_score": region.score})
+        return entries
+
+    def _estimator(self, obj_id: int) -> PoseEstimator:
+        if obj_id not in self._estimators:
+            o = self.options
+            self._estimators[obj_id] = PoseEstimator(
+                self.data.model(obj_id), preset=o.preset, weights=o.weights, options=o.estimate, threads=o.threads
+            )
+        return self._estimators[obj_id]
+
+
+def disturbed(truth: Truth, estimator: PoseEstimator, options: EvalOptions) -> Pose:
+    """The truth disturbed about the object's centre, by random numbers of this instance alone."""
+    i, model = truth.instance, estimator.model
+    rng = np.random.default_rng([options.estimate.seed, i.scene, i.image, i.index])
+    return options.pose_noise.disturb(i.T_cam_obj @ model.T_obj_ctr, rng) @ model.T_obj_ctr.inverse()
+
+
+def detections_for(data: Any, options: EvalOptions) -> dict[tuple[int, int], list[FoundRegion]]:
+    """A detections file, checked against the whole data set."""
+    known = dict.fromkeys(data.images(), ())
+    return read_detections(Path(options.detections), known, data.model_ids())
+
+
+def _prompted(view: View, box: Any, estimator: PoseEstimator) -> list[Detection]:
+    """A box as a person would give it; none where it is empty or outside the picture."""
+    if box is None:
+        return []
+    try:
+        clip_box(box, view.camera)
+    except PromptError:
+        return []
+    return BoxPrompt(box).detect(view, [estimator.model])
+
+
+def _truth(truth: Truth, chosen: list[Truth]) -> Record:
+    i = truth.instance
+    counted = any(truth is other for other in chosen)
+    return {"index": i.index, "obj_id": i.obj_id, "visible": truth.visible, "counted": counted, "mask": truth.source}
+
+
+def _entry(estimate: Estimate, obj_id: int, index: int | None) -> Record:
+    return {
+        "obj_id": obj_id,
+        "index": index,
+        "T_cam_obj": estimate.T_cam_obj.matrix.tolist(),
+        "score": float(estimate.score),
+        "angle_deg": float(np.rad2deg(estimate.angle)),
+        "iterations": int(estimate.iterations),
+        "converged": bool(estimate.converged),
+        "seconds": estimate.timings["total"],
+        "trace": [[step.T_cam_obj.matrix.tolist(), float(np.rad2deg(step.angle))] for step in estimate.trace],
+    }
+
+
+def overlaps(found: Sequence[FoundRegion], truths: Sequence[Truth]) -> dict[str, Record]:
+    """For each object the detections' scores, and their IoU with the truths by box and by mask."""
+    result: dict[str, Record] = {}
+    for obj_id in sorted({r.obj_id for r in found} | {t.instance.obj_id for t in truths}):
+        regions = [r for r in found if r.obj_id == obj_id]
+        here = [t for t in truths if t.instance.obj_id == obj_id]
+        shape = (len(regions), len(here))
+        boxes = [t.box_all or (0.0, 0.0, 0.0, 0.0) for t in here]
+        masked = bool(regions) and all(r.rle is not None for r in regions)
+        result[str(obj_id)] = {
+            "scores": [r.score for r in regions],
+            "ignored": [t.visible < IGNORED_BELOW for t in here],
+            "box_iou": box_iou([r.box for r in regions], boxes).reshape(shape).tolist(),
+            "mask_iou": mask_iou(regions, here).tolist() if masked or not regions else None,
+        }
+    return result
+
+
+def mask_iou(regions: Sequence[FoundRegion], truths: Sequence[Truth]) -> NDArray[np.float64]:
+    """(D, G)."""
+    found, true = [r.mask() for r in regions], [t.read_mask() for t in truths]
+    iou = np.zeros((len(found), len(true)))
+    for d, a in enumerate(found):
+        for g, b in enumerate(true):
+            either = (a | b).sum() if a is not None else 0
+            iou[d, g] = (a & b).sum() / either if a is not None and either else 0.0
+    return iou
+
+
+def run_once(stage: ImageStage, scene: int, image: int) -> Record:
+    """A picture's record with the seconds it took."""
+    started = time.perf_counter()
+    record = stage.run(scene, image)
+    return record | {"seconds": time.perf_counter() - started}
