@@ -65,15 +65,6 @@ def test_help_loads_nothing_heavy() -> None:
     assert result.stdout.split()[-1] == "[]", result.stdout + result.stderr
 
 
-def test_help_is_fast() -> None:
-    def seconds() -> float:
-        start = time.perf_counter()
-        assert python("-m", "posekit", "--help").returncode == 0
-        return time.perf_counter() - start
-
-    assert min(seconds() for _ in range(5)) < 0.5
-
-
 @pytest.mark.parametrize("command", ["estimate", "refine", "render-views", "doctor", "demo"])
 def test_every_command_has_help(command: str) -> None:
     result = CliRunner().invoke(app, [command, "--help"])
@@ -422,7 +413,7 @@ def test_interrupt_is_exit_code_130(folder: Path, tmp_path: Path) -> None:
     """Ctrl-C in the middle of an endless refinement."""
     command = [sys.executable, "-m", "posekit", "refine", str(folder / "photo.png"), "--model", str(folder / "toy.ply")]
     command += ["--pose", str(folder / "pose.json"), "--camera", CAMERA, "--weights", str(folder / "untrained")]
-    command += ["--stop", "fixed", "--iterations", "100000000"]
+    command += ["--update", "regression", "--stop", "fixed", "--iterations", "100000000"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
     assert process.stderr is not None
     assert process.stderr.readline().startswith("note: toy.ply")  # the command runs
