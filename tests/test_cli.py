@@ -409,12 +409,18 @@ def test_wrong_usage_is_exit_code_2() -> None:
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals")
+def listen_to_interrupts() -> None:
+    """A shell's background jobs, and what they start, ignore SIGINT; what Ctrl-C reaches does not."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def test_interrupt_is_exit_code_130(folder: Path, tmp_path: Path) -> None:
     """Ctrl-C in the middle of an endless refinement."""
     command = [sys.executable, "-m", "posekit", "refine", str(folder / "photo.png"), "--model", str(folder / "toy.ply")]
     command += ["--pose", str(folder / "pose.json"), "--camera", CAMERA, "--weights", str(folder / "untrained")]
     command += ["--update", "regression", "--stop", "fixed", "--iterations", "100000000"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path,
+                               preexec_fn=listen_to_interrupts)  # fmt: skip
     assert process.stderr is not None
     assert process.stderr.readline().startswith("note: toy.ply")  # the command runs
     time.sleep(3)
