@@ -65,15 +65,6 @@ def test_help_loads_nothing_heavy() -> None:
     assert result.stdout.split()[-1] == "[]", result.stdout + result.stderr
 
 
-def test_help_is_fast() -> None:
-    def seconds() -> float:
-        start = time.perf_counter()
-        assert python("-m", "posekit", "--help").returncode == 0
-        return time.perf_counter() - start
-
-    assert min(seconds() for _ in range(5)) < 0.5
-
-
 @pytest.mark.parametrize("command", ["estimate", "refine", "render-views", "doctor", "demo"])
 def test_every_command_has_help(command: str) -> None:
     result = CliRunner().invoke(app, [command, "--help"])
@@ -418,12 +409,18 @@ def test_wrong_usage_is_exit_code_2() -> None:
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals")
+def listen_to_interrupts() -> None:
+    """A shell's background jobs, and what they start, ignore SIGINT; what Ctrl-C reaches does not."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def test_interrupt_is_exit_code_130(folder: Path, tmp_path: Path) -> None:
     """Ctrl-C in the middle of an endless refinement."""
     command = [sys.executable, "-m", "posekit", "refine", str(folder / "photo.png"), "--model", str(folder / "toy.ply")]
     command += ["--pose", str(folder / "pose.json"), "--camera", CAMERA, "--weights", str(folder / "untrained")]
-    command += ["--stop", "fixed", "--iterations", "100000000"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
+    command += ["--update", "regression", "--stop", "fixed", "--iterations", "100000000"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path,
+                               preexec_fn=listen_to_interrupts)  # fmt: skip
     assert process.stderr is not None
     assert process.stderr.readline().startswith("note: toy.ply")  # the command runs
     time.sleep(3)

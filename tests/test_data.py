@@ -111,7 +111,8 @@ def test_a_seed_gives_the_same_batches() -> None:
     first, again, other = (iter(PairStream(small(), seed)) for seed in (1, 1, 2))
     for _ in range(3):
         a, b, c = next(first), next(again), next(other)
-        assert set(a) == {"observed", "rendered", "flow", "valid", "visible", "quat_wxyz", "v", "angle", "lost"}
+        dense = {"observed", "rendered", "flow", "relief", "valid", "visible"}
+        assert set(a) == dense | {"focal", "quat_wxyz", "v", "angle", "lost"}
         assert all(torch.equal(a[k], b[k]) for k in a)
         assert not torch.equal(a["observed"], c["observed"])
     assert a["observed"].shape == (4, 120, 160, 4) and a["flow"].shape == (4, 2, 30, 40)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import random
 import signal
 import subprocess
@@ -367,8 +366,9 @@ def test_a_killed_run_goes_on_and_ends_with_the_same_table(alone: Path, root: Pa
         while len(list(out.glob("pictures/*.json"))) < goal and process.poll() is None and time.monotonic() < deadline:
             time.sleep(0.002)
         time.sleep(chance.uniform(0, 0.05))
-        os.kill(process.pid, signal.SIGKILL)
-        process.wait()
+        process.kill()
+        code = process.wait()
+        assert goal > 1 or code == -signal.SIGKILL  # a fast machine may be done with the rest in the second round
         kept = {p: p.stat().st_mtime_ns for p in out.glob("pictures/*.json")}
         assert len(kept) >= goal
         assert all(json.loads(p.read_text())["estimates"] for p in kept)  # no half-written record

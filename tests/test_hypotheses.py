@@ -89,7 +89,7 @@ def test_mvnet_answers_relative_to_the_frontal_view(renderer: Renderer) -> None:
     model = bracket()
     truth = Pose(random_rotation(np.random.default_rng(3)), [0.25, -0.15, 0.8]) @ model.T_obj_ctr.inverse()
     view, detection = seen(renderer, truth)
-    networks = build("lite", LiteConfig(widths=(8, 16, 16), features=16, hidden=16, context=16))
+    networks = build("lite", LiteConfig(widths=(16, 32), blocks=1, fine=16))
     search = MVNetSearch(model, networks, renderer)
     zoom = zoom_to_box(CAMERA, detection.box, networks.size)
     target = Pose.rotation(zoom.R_view_cam) @ truth @ model.T_obj_ctr
@@ -109,7 +109,7 @@ def test_mvnet_answers_relative_to_the_frontal_view(renderer: Renderer) -> None:
 
 
 def test_mvnet_views_are_the_six_faces(renderer: Renderer) -> None:
-    networks = build("lite", LiteConfig(widths=(8, 16, 16), features=16, hidden=16, context=16))
+    networks = build("lite", LiteConfig(widths=(16, 32), blocks=1, fine=16))
     search = MVNetSearch(bracket(), networks, renderer)
     looking = np.stack([R[2] for R in search.rotations])  # the optical axis in the object's frame
     np.testing.assert_allclose(looking @ looking.T, np.round(looking @ looking.T), atol=1e-12)

@@ -10,22 +10,34 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from posekit.camera import Camera
 from posekit.errors import WeightsError
 from posekit.nets.flownet import LAYERS, FlowNetEncoder
 from posekit.nets.heads import PoseHeads, Prediction, compress_angle, expand_angle
-from posekit.nets.inputs import images_to_tensor, to_input
-from posekit.nets.lite import Correlation, LiteConfig, LiteMVNet, LiteSVNet, likeness_of
+from posekit.nets.inputs import images_to_tensor, relief, to_input
+from posekit.nets.lite import LiteConfig, LiteMVNet, LiteSVNet, attention, likeness_of, soft_flow, warp
 from posekit.nets.losses import Target, dense_loss, matching_loss, mvnet_loss, svnet_loss
 from posekit.nets.paper import Branch, PaperMVNet, PaperSVNet
+from posekit.nets.rigid import Motion, Surface, exp_so3, induced_flow, solve_motion
 from posekit.nets.weights import PaperConfig, build, find_weights, load_networks, save_networks
+from posekit.view import View
 
-SMALL = LiteConfig(size=(64, 48), widths=(8, 16, 16), features=16, hidden=16, context=16, radius=2, updates=2)
+SMALL = LiteConfig(size=(64, 48), widths=(16, 32), blocks=2, fine=16)
 TINY_PAPER = PaperConfig(size=(128, 96), width=0.125)
 
 
 def pictures(count: int, size: tuple[int, int], seed: int = 0) -> torch.Tensor:
     generator = torch.Generator().manual_seed(seed)
     return torch.rand(count, 4, size[1], size[0], generator=generator) - 0.5
+
+
+def lite_pair(count: int, size: tuple[int, int] = SMALL.size) -> tuple[torch.Tensor, ...]:
+    """What LiteSVNet takes: observed, rendered, relief, focal."""
+    observed, rendered = pictures(count, size), pictures(count, size, 1)
+    rendered[:, 3] = 0
+    rendered[:, 3, 8:-8, 8:-8] = 1
+    bumps = 0.2 * torch.rand(count, size[1] // 4, size[0] // 4, generator=torch.Generator().manual_seed(2))
+    return observed, rendered, bumps, torch.full((count,), 6.0)
 
 
 def test_the_paper_preset_has_the_papers_layers() -> None:
@@ -89,21 +101,23 @@ def test_a_foreign_checkpoint_is_refused() -> None:
 
 def test_lite_answers_on_its_anchors() -> None:
     net = LiteSVNet(SMALL).eval()
-    output = net.predict(pictures(3, SMALL.size), pictures(3, SMALL.size, 1))
+    output = net.predict(*lite_pair(3))
     prediction = output.prediction
     assert prediction.flow is not None and prediction.flow.shape == (3, 2, 12, 16)
     assert prediction.log_scale is not None and prediction.log_scale.shape == (3, 12, 16)
     assert prediction.visibility is not None and prediction.visibility.shape == (3, 12, 16)
-    assert [f.shape for f in output.flows] == [(3, 2, 6, 8)] * SMALL.updates
-    assert output.compressed_angle.shape == (3,) and output.likeness.shape == (3, 48, 48)
+    assert [f.shape for f in output.flows] == [(3, 2, 6, 8)] * 2
+    assert [f.shape for f in output.rigid] == [(3, 2, 12, 16)] * 2
+    assert output.compressed_angle.shape == (3,)
+    assert [x.shape for x in output.likenesses] == [(3, 48, 48)] * 2
 
 
 def test_the_lite_preset_is_small_and_answers_in_one_batch_as_alone() -> None:
     net = LiteSVNet().eval()
-    assert sum(p.numel() for p in net.parameters()) < 4e6
-    observed, rendered = pictures(2, (160, 120)), pictures(2, (160, 120), 1)
+    assert sum(p.numel() for p in net.parameters()) < 8e6
+    pair = lite_pair(2, (160, 120))
     with torch.inference_mode():
-        both, alone = net(observed, rendered), net(observed[1:], rendered[1:])
+        both, alone = net(*pair), net(*(x[1:] for x in pair))
     torch.testing.assert_close(both.flow[1:], alone.flow, atol=1e-3, rtol=1e-3)
 
 
@@ -126,29 +140,69 @@ def test_weights_without_mvnet_load_without_it(tmp_path: Path) -> None:
     assert load_networks("lite", tmp_path).mvnet is None
 
 
-def test_correlation_finds_a_shifted_picture() -> None:
+def test_matching_finds_a_shifted_picture() -> None:
     generator = torch.Generator().manual_seed(0)
-    rendered = torch.randn(1, 32, 12, 16, generator=generator)
+    rendered = torch.randn(1, 64, 12, 16, generator=generator)
     observed = torch.roll(rendered, shifts=(1, 2), dims=(2, 3))  # down 1, right 2
-    ys, xs = torch.meshgrid(torch.arange(12.0), torch.arange(16.0), indexing="ij")
-    found = Correlation(likeness_of(rendered, observed), (12, 16), levels=1, radius=3).lookup(
-        torch.stack([xs, ys])[None]
-    )
-    best = found[0, :, 4:8, 4:10].argmax(0)  # away from the sides; window rows are y, columns x
-    assert torch.all(best // 7 - 3 == 1) and torch.all(best % 7 - 3 == 2)
+    flow, peak = soft_flow(50 * likeness_of(rendered, observed), (12, 16))
+    inner = flow[0, :, :11, :14]  # what was not rolled over the side
+    torch.testing.assert_close(inner, torch.tensor([16.0, 8.0]).view(2, 1, 1).expand_as(inner), atol=0.05, rtol=0)
+    assert float(peak.min()) > 0.9
 
 
-def test_correlation_levels_look_at_the_same_place() -> None:
-    """A bump at an even cell must be central in both levels when looked up where it is."""
-    rendered, observed = torch.zeros(1, 1, 8, 8), torch.zeros(1, 1, 8, 8)
-    rendered[0, 0, 4, 4] = 1
-    observed[0, 0, 2:4, 4:6] = 1  # centre (4.5, 2.5): the centre of a cell of level 1
-    centre = torch.zeros(1, 2, 8, 8)
-    centre[:, 0], centre[:, 1] = 4.5, 2.5
-    likeness = torch.einsum("bcn,bcm->bnm", rendered.flatten(2), observed.flatten(2))
-    found = Correlation(likeness, (8, 8), levels=2, radius=1).lookup(centre)[0, :, 4, 4].view(2, 3, 3)
-    torch.testing.assert_close(found[0, 1, 1], torch.tensor(1.0))
-    torch.testing.assert_close(found[1], torch.tensor([[0.0, 0, 0], [0, 1, 0], [0, 0, 0]]))
+def test_warping_by_the_flow_undoes_the_shift() -> None:
+    x = torch.randn(1, 16, 12, 16, generator=torch.Generator().manual_seed(0))
+    moved = torch.roll(x, shifts=(1, 2), dims=(2, 3))
+    flow = torch.tensor([2.0, 1.0]).view(1, 2, 1, 1).expand(1, 2, 12, 16)
+    torch.testing.assert_close(warp(moved, flow)[..., :11, :14], x[..., :11, :14], atol=1e-4, rtol=0)
+
+
+def test_attention_is_torchs() -> None:
+    q, k, v = torch.randn(3, 2, 2, 10, 8, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(attention(q, k, v), torch.nn.functional.scaled_dot_product_attention(q, k, v))
+
+
+def bumpy_surface(count: int) -> Surface:
+    generator = torch.Generator().manual_seed(4)
+    return Surface.of(0.3 * torch.rand(count, 12, 16, generator=generator), torch.full((count,), 5.0), 4, 2.0)
+
+
+def test_the_motion_behind_a_flow_is_found() -> None:
+    surface = bumpy_surface(3)
+    turn = torch.tensor([[0.3, 0.0, 0.0], [0.0, -0.4, 0.1], [0.1, 0.1, 0.5]])
+    true = Motion(exp_so3(turn), torch.tensor([[0.01, 0.0, 0.05], [0.0, 0.02, -0.04], [0.0, 0.0, 0.0]]))
+    found = solve_motion(surface, induced_flow(surface, true), torch.ones(3, 192), steps=6)
+    torch.testing.assert_close(found.R, true.R, atol=1e-3, rtol=0)
+    torch.testing.assert_close(found.t, true.t, atol=1e-3, rtol=0)
+
+
+def test_anchors_without_weight_do_not_move_the_motion() -> None:
+    surface, weight = bumpy_surface(1), torch.ones(1, 192)
+    flow = torch.zeros(1, 192, 2)
+    flow[:, ::3], weight[:, ::3] = 50.0, 0.0
+    found = solve_motion(surface, flow, weight)
+    torch.testing.assert_close(found.R[0], torch.eye(3), atol=1e-4, rtol=0)
+    none = solve_motion(surface, flow, torch.zeros(1, 192))
+    torch.testing.assert_close(none.R[0], torch.eye(3), atol=1e-4, rtol=0)
+
+
+def test_the_solver_teaches_its_weights() -> None:
+    """The gradient of the pose's error must lower the weight of the one wrong anchor."""
+    surface, flow = bumpy_surface(1), torch.zeros(1, 192, 2)
+    flow[:, 17] = 30.0
+    weight = torch.ones(1, 192, requires_grad=True)
+    induced_flow(surface, solve_motion(surface, flow, weight)).square().sum().backward()
+    assert weight.grad is not None and int(weight.grad[0].argmax()) == 17 and float(weight.grad[0, 17]) > 0
+
+
+def test_relief_is_depth_about_its_mean_in_widths() -> None:
+    camera = Camera(80.0, 80.0, 7.5, 5.5, 16, 12)
+    depth = np.zeros((12, 16), np.float32)
+    depth[2, 2], depth[2, 6] = 1.0, 1.2
+    found = relief(View(np.zeros((12, 16, 3), np.uint8), camera, depth > 0, depth))
+    assert found.shape == (3, 4)
+    np.testing.assert_allclose(found[0, :2], [-0.1 / 1.1 * 5, 0.1 / 1.1 * 5], rtol=1e-5)
+    assert not found[1:].any()
 
 
 def test_inputs_agree() -> None:
@@ -214,7 +268,7 @@ def test_lost_pairs_teach_the_angle_alone() -> None:
     net = LiteSVNet(SMALL)
     target = random_target(2, SMALL)
     target.lost[:] = True
-    loss, parts = dense_loss(net.predict(pictures(2, SMALL.size), pictures(2, SMALL.size, 1)), net.heads, target)
+    loss, parts = dense_loss(net.predict(*lite_pair(2)), net.heads, target)
     assert parts["rotation"] == parts["translation"] == parts["likelihood"] == 0
     loss.backward()
     assert net.heads.rotation.weight.grad is None or not net.heads.rotation.weight.grad.any()
@@ -227,11 +281,11 @@ def test_one_batch_is_over_fitted() -> None:
     net = LiteSVNet(SMALL)
     target = random_target(4, SMALL)
     net.heads.set_statistics(target.quat_wxyz, target.v)
-    observed, rendered = pictures(4, SMALL.size), pictures(4, SMALL.size, 1)
+    pair = lite_pair(4)
     optimiser = torch.optim.AdamW(net.parameters(), lr=3e-3)
     found: list[dict[str, float]] = []
     for _ in range(150):
-        loss, parts = dense_loss(net.predict(observed, rendered), net.heads, target)
+        loss, parts = dense_loss(net.predict(*pair), net.heads, target)
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

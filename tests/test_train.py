@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
 from typer.testing import CliRunner
 
 from objects import bracket
@@ -28,7 +29,9 @@ from posekit.data.bop import BopDataset
 from posekit.data.stream import PairStream, StreamConfig
 from posekit.errors import ConfigError, OutputError, TrainingError, WeightsError
 from posekit.geometry import Pose, random_rotation
+from posekit.nets.flownet import LAYERS
 from posekit.nets.lite import LiteConfig, LiteSVNet
+from posekit.nets.paper import PaperSVNet
 from posekit.nets.weights import load_networks
 from posekit.render import Renderer
 from posekit.train.checkpoint import Checkpoint, Checkpoints
@@ -46,7 +49,7 @@ from posekit.train.paper import PaperTask
 from posekit.train.pose import make_task, resume_pose, train_pose
 from posekit.train.sources import Sources
 
-SMALL = LiteConfig(widths=(16, 16, 16), features=16, hidden=16, context=16, updates=2)
+SMALL = LiteConfig(widths=(16, 32), blocks=1, fine=16)
 STREAM = StreamConfig(batch=2, shard=2, pool=16, per_object=4, mvnet=1)
 CONFIG = TrainConfig(
     steps=4, validate=100, save=2, log=1, cases=1, stream=STREAM, lite=SMALL,
@@ -281,19 +284,80 @@ def bop_folder(root: Path, count: int = 4) -> Path:
         f"{vertices}\n{faces}\n"
     )
     rng = np.random.default_rng(0)
-    poses = [Pose(random_rotation(rng), np.array([0.0, 0.0, 0.5])) for _ in range(count)]
+    poses, boxes = [Pose(random_rotation(rng), np.array([0.0, 0.0, 0.5])) for _ in range(count)], {}
     for k, view in enumerate(Renderer().render(model, poses, camera)):
         assert view.mask is not None
+        x, y, w, h = cv2.boundingRect(view.mask.astype(np.uint8))
+        boxes[str(k)] = [{"bbox_obj": [x, y, w, h], "bbox_visib": [x, y, w, h], "visib_fract": 1.0}]
         cv2.imwrite(str(scene / "rgb" / f"{k:06d}.png"), view.image[..., ::-1])
         cv2.imwrite(str(scene / "mask_visib" / f"{k:06d}_000000.png"), view.mask.astype(np.uint8) * 255)
     truths = {str(k): [{"obj_id": 1, "cam_R_m2c": p.R.ravel().tolist(), "cam_t_m2c": (p.t * 1000).tolist()}]
               for k, p in enumerate(poses)}  # fmt: skip
     (scene / "scene_gt.json").write_text(json.dumps(truths))
+    (scene / "scene_gt_info.json").write_text(json.dumps(boxes))
     (scene / "scene_camera.json").write_text(json.dumps({k: {"cam_K": camera.K.ravel().tolist()} for k in truths}))
     return root
 
 
+def test_the_papers_recipe_takes_an_encoder_a_validation_set_and_a_profile(tmp_path: Path) -> None:
+    """The command with all that the recipe can be fed with, at a size for tests."""
+    folder = bop_folder(tmp_path / "set")
+    (folder / "test").symlink_to(folder / "train")
+    width = {"conv1": 16, "conv2": 32, "conv3": 64, "conv4": 128, "conv5": 128, "conv6": 256}
+    state, last = {}, 6
+    for name, kernel, _, _ in LAYERS:
+        out = width[name[:5]]
+        state[f"{name}.0.weight"] = torch.full((out, last, kernel, kernel), 0.01)
+        state[f"{name}.0.bias"] = torch.full((out,), 0.25)
+        last = out
+    save_file(state, tmp_path / "flownets.safetensors")
+    file, out = tmp_path / "a.toml", tmp_path / "mine"
+    config = changed(PAPER, {"overfit": False, "cases": 2, "optimiser": {"rate": 1e-9}}, "here")
+    file.write_text(write_config(config))
+    described = folder / "train" / "000001" / "scene_gt_info.json"
+    kept = described.read_text()
+    described.unlink()
+    arguments = ["train", "pose", "--recipe", "paper", "--config", str(file), "--steps", "13", "--profile",
+                 "--bop", f"{folder}:train=1", "--flownets", str(tmp_path / "flownets.safetensors"),
+                 "--validate-on", str(folder), "--out", str(out)]  # fmt: skip
+    refused = CliRunner().invoke(app, arguments)
+    assert refused.exit_code == 1 and "shows nothing to measure on" in refused.output
+    described.write_text(kept)
+    result = CliRunner().invoke(app, [*arguments, "--force"])
+    assert result.exit_code == 0, result.output
+    svnet = load_networks("paper", out).svnet
+    assert isinstance(svnet, PaperSVNet)
+    encoder = svnet.branch.encoder.state_dict()
+    biases = [v for k, v in encoder.items() if k.endswith("bias")]
+    assert biases and all(torch.allclose(b, torch.tensor(0.25), atol=1e-3) for b in biases)
+    assert "convolution" in (out / "profile.txt").read_text()
+    header = (out / "validation.csv").read_text().splitlines()[0]
+    assert "bop_within_5" in header and "first_within_25deg" in header
+
+
 # --- several processes ---
+
+
+def test_the_command_starts_the_processes_that_it_is_asked_for(tmp_path: Path) -> None:
+    file, out = tmp_path / "a.toml", tmp_path / "two"
+    file.write_text(write_config(CONFIG))
+    command = [
+        sys.executable,
+        "-m",
+        "posekit",
+        "train",
+        "pose",
+        "--config",
+        str(file),
+        "--devices",
+        "2",
+        "--out",
+        str(out),
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=200, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("weights:") == 1, "one process reports"
+    assert load_networks("lite", out).mvnet is not None
 
 
 def test_two_processes_train_as_one_with_twice_the_batch(tmp_path: Path) -> None:

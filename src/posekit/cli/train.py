@@ -37,7 +37,7 @@ def pose(
     meshes: Annotated[
         list[Path] | None, typer.Option(metavar="DIR", help="A folder of meshes.", rich_help_panel=SOURCES)
     ] = None,
-    units: Annotated[Units, typer.Option(help="Of the meshes.", rich_help_panel=SOURCES)] = "auto",
+    units: Annotated[Units | None, typer.Option(help="Of the meshes; auto.", rich_help_panel=SOURCES)] = None,
     bop: Annotated[
         list[str] | None,
         typer.Option(metavar="DIR[:SPLIT][=WEIGHT]", help="A BOP data set (paper recipe).", rich_help_panel=SOURCES),
@@ -78,7 +78,8 @@ def pose(
         Literal["auto", "cpu", "cuda"] | None, typer.Option(help="What computes.", rich_help_panel=MACHINE)
     ] = None,
     precision: Annotated[
-        Literal["32-true", "bf16-mixed", "16-mixed"] | None, typer.Option(help="Of numbers.", rich_help_panel=MACHINE)
+        Literal["auto", "32-true", "bf16-mixed", "16-mixed"] | None,
+        typer.Option(help="Of numbers.", rich_help_panel=MACHINE),
     ] = None,
     workers: Annotated[
         int | None, typer.Option(help="Processes that render, for each that trains.", rich_help_panel=MACHINE)

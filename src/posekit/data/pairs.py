@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from posekit.camera import Camera
 from posekit.geometry import Pose, PoseNoise, random_rotation, rotation_angle, rotation_between, so3_exp, so3_log
+from posekit.nets.inputs import relief
 from posekit.nets.pose_delta import delta_between
 from posekit.object_model import ObjectModel
 from posekit.render import Light, Renderer
@@ -47,7 +48,8 @@ class Pair:
 
     target, source: uint8 (H, W, 4), RGB and alpha = mask. flow: float32 (h, w, 2), crop pixels from the source's
     anchor to the target's place. valid: bool (h, w), the anchor lies on the source. seen: bool (h, w), the
-    anchor's surface point is not hidden by the object itself in the target. quat_wxyz: (4,). v: (3,).
+    anchor's surface point is not hidden by the object itself in the target. relief: float16 (h, w), the
+    source's, see ``nets.inputs.relief``. focal: the crop's focal length in its widths. quat_wxyz: (4,). v: (3,).
     angle: radians. lost: True where the source is in another basin.
     """
 
@@ -56,6 +58,8 @@ class Pair:
     flow: NDArray[np.float32]
     valid: NDArray[np.bool_]
     seen: NDArray[np.bool_]
+    relief: NDArray[np.float16]
+    focal: float
     quat_wxyz: NDArray[np.float32]
     v: NDArray[np.float32]
     angle: float
@@ -140,6 +144,8 @@ def render_pairs(
                 flow=flow,
                 valid=valid,
                 seen=seen,
+                relief=relief(s).astype(np.float16),
+                focal=camera.fx / camera.width,
                 quat_wxyz=quat.astype(np.float32),
                 v=delta.v.astype(np.float32),
                 angle=delta.angle,

@@ -215,7 +215,7 @@ def worker_lane(start: int) -> tuple[int, int]:
 
 
 def collate(samples: Sequence[Sample]) -> Batch:
-    """observed, rendered: uint8 (B, H, W, 4); flow (B, 2, h, w); valid, visible (B, h, w); the rest (B, ...)."""
+    """observed, rendered: uint8 (B, H, W, 4); flow (B, 2, h, w); relief, valid, visible (B, h, w); others (B, ...)."""
     pairs = [s.pair for s in samples]
 
     def stack(arrays: Sequence[NDArray]) -> Tensor:  # type: ignore[type-arg]
@@ -225,6 +225,8 @@ def collate(samples: Sequence[Sample]) -> Batch:
         "observed": stack([s.observed for s in samples]),
         "rendered": stack([s.rendered for s in samples]),
         "flow": stack([p.flow for p in pairs]).permute(0, 3, 1, 2).contiguous(),
+        "relief": stack([p.relief for p in pairs]),
+        "focal": torch.tensor([p.focal for p in pairs], dtype=torch.float32),
         "valid": stack([p.valid for p in pairs]),
         "visible": stack([s.visible for s in samples]),
         "quat_wxyz": stack([p.quat_wxyz for p in pairs]),

@@ -7,6 +7,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from posekit.view import View
+
 
 def to_input(image: NDArray[np.uint8], mask: NDArray[np.bool_] | None) -> NDArray[np.float32]:
     """uint8 RGB (..., H, W, 3) and bool (..., H, W) -> float32 (..., 4, H, W): RGB in [-0.5, 0.5], mask 0 or 1.
@@ -18,6 +20,18 @@ def to_input(image: NDArray[np.uint8], mask: NDArray[np.bool_] | None) -> NDArra
     if mask is not None:
         out[..., 3, :, :] = mask
     return out
+
+
+def relief(rendered: View) -> NDArray[np.float32]:
+    """How much farther than the object's mean depth its surface lies at each anchor (every 4th pixel from (2, 2) on),
+    in widths of the crop, (h, w); zero beside the object. rendered: a view with depth."""
+    assert rendered.depth is not None
+    depth = rendered.depth[2::4, 2::4]
+    on = depth > 0
+    if not on.any():
+        return np.zeros_like(depth)
+    mean = depth[on].mean()
+    return np.where(on, (depth / mean - 1) * (rendered.camera.fx / rendered.camera.width), 0).astype(np.float32)
 
 
 def images_to_tensor(rgbm: Tensor) -> Tensor:

@@ -45,13 +45,16 @@ class DenseLossConfig:
     hidden: float = 0.3
     flow: float = 0.25
     match: float = 1.0
+    early: float = 0.3
     likelihood: float = 0.5
+    rigid: float = 0.5
     visibility: float = 1.0
     rotation: float = 1.0
     translation: float = 1.0
     angle: float = 1.0
     mvnet: float = 1.0
     max_flow_px: float = 80.0
+    knee_px: float = 8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +87,8 @@ def dense_loss(
         sequence = sequence + config.gamma ** (len(flows) - 1 - k) * (error * cells).sum() / total_cells
 
     shown = F.avg_pool2d((near & target.visible)[:, None].float(), 2)[:, 0] > 0.5
-    match = matching_loss(output.likeness, flow_cells, shown)
+    match = matching_loss(output.likenesses[-1], flow_cells, shown)
+    early = matching_loss(output.likenesses[0], flow_cells, shown)
 
     total = weight.sum().clamp_min(1.0)
     error = (prediction.flow - target.flow).abs().sum(1)
@@ -92,6 +96,10 @@ def dense_loss(
     judged = near.float()
     visibility = F.binary_cross_entropy_with_logits(prediction.visibility, target.visible.float(), judged)
     visibility = visibility * judged.numel() / judged.sum().clamp_min(1.0)
+
+    judged_rigid = (target.valid & ~target.lost[:, None, None]).float()
+    rigids = [rigid_loss(flow, target.flow, judged_rigid, config.knee_px) for flow in output.rigid]
+    rigid = sum(config.gamma ** (len(rigids) - 1 - k) * value for k, value in enumerate(rigids))
 
     kept = (~target.lost).float()
     count = kept.sum().clamp_min(1.0)
@@ -102,7 +110,9 @@ def dense_loss(
     loss = (
         config.flow * sequence
         + config.match * match
+        + config.early * early
         + config.likelihood * likelihood
+        + config.rigid * rigid
         + config.visibility * visibility
         + config.rotation * rotation
         + config.translation * translation
@@ -110,9 +120,20 @@ def dense_loss(
     )
     seen = (near & target.visible).float()
     epe = ((prediction.flow - target.flow).detach().norm(dim=1) * seen).sum() / seen.sum().clamp_min(1.0)
-    parts = {"epe_px": epe, "match": match, "likelihood": likelihood, "visibility": visibility, "rotation": rotation,
-             "translation": translation, "angle": angle}  # fmt: skip
+    parts = {"epe_px": epe, "match": match, "early": early, "rigid": rigids[-1], "rigid1": rigids[0],
+             "likelihood": likelihood, "visibility": visibility, "rotation": rotation, "translation": translation,
+             "angle": angle}  # fmt: skip
     return loss, {name: float(value.detach()) for name, value in parts.items()}
+
+
+def rigid_loss(flow: Tensor, truth: Tensor, judged: Tensor, knee: float) -> Tensor:
+    """Mean distance in pixels on the whole object, hidden parts too: the pose's own error as the crop shows it.
+
+    flow, truth: (B, 2, h, w). judged: (B, h, w). knee: pixels from where the distance counts by its logarithm, so that
+    a solver gone astray does not drown the rest.
+    """
+    error = (flow - truth.nan_to_num()).pow(2).sum(1).add(1e-6).sqrt()
+    return (knee * torch.log1p(error / knee) * judged).sum() / judged.sum().clamp_min(1.0)
 
 
 def first_pose_loss(

@@ -11,8 +11,10 @@ import torch
 from numpy.typing import NDArray
 
 from posekit.geometry import quat_to_rotation
-from posekit.nets.inputs import to_input
+from posekit.nets.inputs import relief, to_input
+from posekit.nets.lite import LiteSVNet
 from posekit.nets.pose_delta import PoseDelta
+from posekit.nets.precision import has_fast_bfloat16
 from posekit.nets.weights import Networks
 from posekit.view import View
 
@@ -55,18 +57,25 @@ class Predictor(Protocol):
 
 
 class NetworkPredictor:
-    """SV-Net through PyTorch."""
+    """SV-Net through PyTorch. bfloat16: whether to compute in it; None = where the processor does so faster."""
 
-    def __init__(self, networks: Networks) -> None:
+    def __init__(self, networks: Networks, bfloat16: bool | None = None) -> None:
         self.networks = networks
+        self.bfloat16 = has_fast_bfloat16("cpu") if bfloat16 is None else bfloat16
         self.size = networks.size
         self.dense = networks.dense
 
     def predict(self, observed: Sequence[View], rendered: Sequence[View]) -> list[PairPrediction]:
+        svnet = self.networks.svnet
         first = torch.from_numpy(np.stack([to_input(v.image, v.mask) for v in observed]))
         second = torch.from_numpy(np.stack([to_input(v.image, v.mask) for v in rendered]))
-        with torch.inference_mode():
-            out = self.networks.svnet(first, second)
+        with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=self.bfloat16):
+            if isinstance(svnet, LiteSVNet):
+                reliefs = torch.from_numpy(np.stack([relief(v) for v in rendered]))
+                focals = torch.tensor([v.camera.fx / v.camera.width for v in rendered], dtype=torch.float32)
+                out = svnet(first, second, reliefs, focals)
+            else:
+                out = svnet(first, second)
         arrays = [None if x is None else x.float().numpy() for x in
                   (out.quat_wxyz, out.v, out.angle, out.flow, out.log_scale, out.visibility)]  # fmt: skip
         return [unpack(arrays, k, rendered[k]) for k in range(len(observed))]

@@ -20,7 +20,7 @@ from posekit.nets.weights import PaperConfig
 
 RECIPES = ("lite", "paper")
 OPTIMISERS = ("adamw", "sgd")
-PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
+PRECISIONS = ("auto", "32-true", "bf16-mixed", "16-mixed")
 C = TypeVar("C")
 
 
@@ -54,12 +54,13 @@ class OptimiserConfig:
 @dataclass(frozen=True)
 class MachineConfig:
     """threads: of torch in each process; 0 = its own choice. workers: processes that render for each process.
-    devices, nodes: processes per machine and machines. accelerator: Lightning Fabric's name."""
+    devices, nodes: processes per machine and machines. accelerator: Lightning Fabric's name. precision: "auto" is
+    bfloat16 where the processor multiplies in it, else float32."""
 
     accelerator: str = "auto"
     devices: int = 1
     nodes: int = 1
-    precision: str = "bf16-mixed"
+    precision: str = "auto"
     threads: int = 0
     workers: int = 1
 

@@ -32,7 +32,12 @@ class LiteModule(nn.Module):
     def forward(self, batch: Batch, seed: int) -> tuple[Tensor, dict[str, float]]:  # noqa: ARG002 - nothing is drawn
         svnet = self.nets["svnet"]
         assert isinstance(svnet, LiteSVNet)
-        output = svnet.predict(images_to_tensor(batch["observed"]), images_to_tensor(batch["rendered"]))
+        output = svnet.predict(
+            images_to_tensor(batch["observed"]),
+            images_to_tensor(batch["rendered"]),
+            batch["relief"].float(),
+            batch["focal"],
+        )
         first = self._first_pose(batch) if "mvnet" in self.nets else None
         with torch.autocast(batch["flow"].device.type, enabled=False):
             loss, parts = dense_loss(output, svnet.heads, target_of(batch), self.config)

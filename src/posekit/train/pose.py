@@ -22,7 +22,7 @@ from posekit.nets.lite import LiteConfig, LiteMVNet, LiteSVNet
 from posekit.nets.weights import Networks, build, load_networks
 from posekit.train.config import TrainConfig, read_config, write_config
 from posekit.train.lite import LiteTask
-from posekit.train.loop import Show, Task, Trainer, make_fabric
+from posekit.train.loop import Show, Task, Trainer, keep_memory, make_fabric
 from posekit.train.paper import PaperTask
 from posekit.train.sources import Sources, read_sources
 
@@ -49,6 +49,7 @@ def resume_pose(out: Path, show: Show | None = None) -> list[dict[str, str]]:
 
 
 def _train(config: TrainConfig, out: Path, show: Show | None) -> list[dict[str, str]]:
+    keep_memory()
     fabric = make_fabric(config)
     sources = read_sources(config.sources)
     torch.manual_seed(config.seed)  # the same new networks in every process

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +15,7 @@ from posekit.errors import ConfigError, MeshError
 from posekit.object_model import ObjectModel
 from posekit.train.config import SourceConfig
 
+TEXTURE = 512  # pixels: longer sides are shrunk, since a crop shows fewer
 MESHES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 
 
@@ -55,7 +57,15 @@ def _meshes(folder: Path, units: str) -> list[ObjectModel]:
     paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in MESHES)
     if not paths:
         raise MeshError(f"the folder {folder} holds no meshes ({', '.join(MESHES)}).")
-    return [ObjectModel.load(path, units=units) for path in paths]
+    return [_light(ObjectModel.load(path, units=units)) for path in paths]
+
+
+def _light(model: ObjectModel) -> ObjectModel:
+    """With a texture no larger than `TEXTURE`: a folder may hold a thousand meshes."""
+    if model.texture is None or max(model.texture.shape[:2]) <= TEXTURE:
+        return model
+    scale = TEXTURE / max(model.texture.shape[:2])
+    return replace(model, texture=cv2.resize(model.texture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
 
 
 def _weighted(text: str) -> tuple[BopDataset, float]:

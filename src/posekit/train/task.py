@@ -11,6 +11,7 @@ from typing import Any
 
 from torch import nn
 
+from posekit.errors import ConfigError
 from posekit.nets.heads import PoseHeads
 from posekit.nets.weights import Networks, save_networks
 from posekit.object_model import ObjectModel
@@ -72,4 +73,12 @@ class PoseTask:
     @cached_property
     def bop(self) -> list[Case]:
         held = self.sources.validation
-        return bop_cases(held, self.config.cases) if held is not None else []
+        if held is None or not self.config.cases:
+            return []
+        found = bop_cases(held, self.config.cases)
+        if not found:
+            raise ConfigError(
+                f"--validate-on {held.root} shows nothing to measure on: no annotated object over 90 % visible with a "
+                "mask in mask_visib/ and a box in scene_gt_info.json."
+            )
+        return found
