@@ -33,6 +33,7 @@ from posekit.nets.flownet import LAYERS
 from posekit.nets.lite import LiteConfig, LiteSVNet
 from posekit.nets.paper import PaperSVNet
 from posekit.nets.weights import load_networks
+from posekit.object_model import ObjectModel
 from posekit.render import Renderer
 from posekit.train.checkpoint import Checkpoint, Checkpoints
 from posekit.train.config import (
@@ -449,7 +450,11 @@ def test_the_command_trains_for_a_mesh_and_reports(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     assert "held-back renderings: rotation" in result.output and "MV-Net's first poses" in result.output
-    assert load_networks("lite", out).about["trained_on"] == "renderings of obj_000001"
+    about = load_networks("lite", out).about
+    assert about["trained_on"] == "renderings of obj_000001"
+    assert about["seen"] == [ObjectModel.load(mesh, units="mm").digest]
+    on = Sources([bracket()] * 5, [], [], None, (("parts", 4),)).about(0.4)
+    assert on == f"renderings of {bracket().name}, 4 meshes of parts; procedural shapes (60%)"
     again = CliRunner().invoke(app, ["train", "pose", "--out", str(out)])
     assert again.exit_code == 1 and "--resume" in again.output
     wrong = CliRunner().invoke(app, ["train", "pose", "--bop", str(tmp_path), "--out", str(tmp_path / "other")])
