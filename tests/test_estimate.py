@@ -61,6 +61,17 @@ def test_the_whole_chain_from_a_mask(examples) -> None:
     assert np.median(turns) < 10 and np.median(shifts) < 0.05
 
 
+def test_only_the_best_hypotheses_go_on(examples) -> None:
+    """All are refined a little, two to the end; a fixed number of iterations stays what was asked for."""
+    options = EstimateOptions(stop="fixed", iterations=5, hypotheses=4)
+    estimator = PoseEstimator(examples[0].model, options=options)
+    compared = []
+    predict = estimator.predictor.predict
+    estimator.predictor.predict = lambda seen, drawn: compared.append(len(seen)) or predict(seen, drawn)  # type: ignore
+    [found] = estimator.estimate(examples[0].view, [masked(estimator.renderer, examples[0])])
+    assert compared == [4, 4, 4, 2, 2] and found.iterations == 5 and len(found.trace) == 5
+
+
 def test_the_same_seed_gives_the_same_estimate(examples) -> None:
     example, poses = examples[0], []
     for _ in range(2):

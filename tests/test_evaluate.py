@@ -23,6 +23,7 @@ from posekit.estimate import EstimateOptions
 from posekit.evaluate import EvalOptions, compare, evaluate
 from posekit.evaluate.bop_results import COLUMNS, ResultRow, csv_name, read_detections, read_results, results_csv
 from posekit.evaluate.stages import ImageStage
+from posekit.evaluate.table import novelty
 from posekit.evaluate.truths import TruthReader
 from posekit.geometry import Pose, so3_exp
 
@@ -325,7 +326,8 @@ def test_what_a_run_leaves(alone: Path, root: Path) -> None:
     results = json.loads((alone / "results.json").read_text())
     assert results["schema"] == 1 and results["stage"] == "refine"
     assert results["weights"]["hash"] and results["commit"] and results["machine"]
-    assert results["per_object"]["1"]["novelty"] in ("seen", "novel", "unknown")
+    assert results["per_object"]["1"]["novelty"] == "novel"
+    assert [novelty(known, "a") for known in (None, frozenset("ab"), frozenset("b"))] == ["unknown", "seen", "novel"]
     assert len(results["instances"]) == results["counts"]["instances"] == 8
     assert len(results["instances"][0]["trace"]) == 1
     assert results["seconds_per_instance"]["median"] > 0

@@ -218,6 +218,12 @@ def test_the_angle_scale_is_its_own_inverse() -> None:
     torch.testing.assert_close(expand_angle(compress_angle(angle)), angle)
 
 
+def test_a_negative_angle_can_be_mended() -> None:
+    value = torch.full((3,), -2.0, requires_grad=True)
+    (torch.full((3,), 0.5) - expand_angle(value)).abs().sum().backward()
+    assert value.grad is not None and (value.grad < 0).all()
+
+
 def test_statistics_make_the_answers_the_targets_mean() -> None:
     heads = PoseHeads(8, with_angle=True)
     quat = torch.nn.functional.normalize(torch.tensor([[1.0, 0.1, 0, 0], [1.0, -0.1, 0.2, 0]]), dim=1)

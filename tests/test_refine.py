@@ -121,6 +121,15 @@ def test_without_convergence_the_lowest_predicted_angle_wins(renderer) -> None:
     assert found.angle == 0.2 and found.T_cam_obj is found.trace[1].T_cam_obj
 
 
+def test_patience_ends_a_loop_that_no_longer_improves(renderer) -> None:
+    model = bracket()
+    truth = Pose(view_rotation([0.5, -1.0, 0.6]), PLACES[0]) @ model.T_obj_ctr.inverse()
+    oracle = Oracle(model, truth, angles=[0.5, 0.2, 0.4, 0.3, 0.1, 0.3, 0.3, 0.3, 0.01])
+    options = RefineOptions(patience=3)
+    found = refine(photograph(renderer, model, truth), model, [truth], oracle, renderer, options)[0]
+    assert found.iterations == 8 and not found.converged and found.angle == 0.1
+
+
 def test_the_fixed_policy_takes_the_last_iterate(renderer) -> None:
     model = bracket()
     truth = Pose(view_rotation([0.5, -1.0, 0.6]), PLACES[0]) @ model.T_obj_ctr.inverse()

@@ -33,6 +33,7 @@ from posekit.nets.flownet import LAYERS
 from posekit.nets.lite import LiteConfig, LiteSVNet
 from posekit.nets.paper import PaperSVNet
 from posekit.nets.weights import load_networks
+from posekit.object_model import ObjectModel
 from posekit.render import Renderer
 from posekit.train.checkpoint import Checkpoint, Checkpoints
 from posekit.train.config import (
@@ -270,6 +271,24 @@ def test_photographs_feed_the_papers_recipe(tmp_path: Path) -> None:
     assert math.isfinite(values["loss"]) and "sv_loss_3" in values
 
 
+def test_the_papers_recipe_trains_at_full_size(tmp_path: Path) -> None:
+    """640x480 and full width on photographs: forward, backward, three inner iterations, and every weight moves."""
+    sources = Sources([], [], [(BopDataset(bop_folder(tmp_path / "set", 2), "train", None), 1.0)], None)
+    asked = {"epochs": 1, "cases": 0, "sources": {"renders": 0.0}, "machine": {"accelerator": "cpu", "workers": 0},
+             "stream": {"batch": 1, "shard": 1, "pool": 2, "reuse": 1}}  # fmt: skip
+    config = changed(default_config("paper"), asked, "here")
+    task = make_task(config, sources)
+    assert task.networks.size == (640, 480)
+    svnet = task.networks.svnet
+    assert isinstance(svnet, PaperSVNet) and svnet.branch.encoder.out_channels == 1024
+    before = {name: value.clone() for name, value in task.nets.named_parameters()}
+    it = Trainer(config, task, make_fabric(config), tmp_path / "run")
+    values = it.train_step(next(it._batches(0)), 0.0)
+    assert math.isfinite(values["loss"]) and all(f"sv_loss_{k}" in values for k in (1, 2, 3))
+    still = [name for name, value in task.nets.named_parameters() if torch.equal(value, before[name])]
+    assert not still
+
+
 def bop_folder(root: Path, count: int = 4) -> Path:
     """``count`` photographs of the bracket in train/000001."""
     model, camera = bracket(), Camera.from_fov(0.6, 320, 240)
@@ -431,7 +450,11 @@ def test_the_command_trains_for_a_mesh_and_reports(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     assert "held-back renderings: rotation" in result.output and "MV-Net's first poses" in result.output
-    assert load_networks("lite", out).about["trained_on"] == "renderings of obj_000001"
+    about = load_networks("lite", out).about
+    assert about["trained_on"] == "renderings of obj_000001"
+    assert about["seen"] == [ObjectModel.load(mesh, units="mm").digest]
+    on = Sources([bracket()] * 5, [], [], None, (("parts", 4),)).about(0.4)
+    assert on == f"renderings of {bracket().name}, 4 meshes of parts; procedural shapes (60%)"
     again = CliRunner().invoke(app, ["train", "pose", "--out", str(out)])
     assert again.exit_code == 1 and "--resume" in again.output
     wrong = CliRunner().invoke(app, ["train", "pose", "--bop", str(tmp_path), "--out", str(tmp_path / "other")])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ from posekit.results import Detection, Estimate
 from posekit.view import View
 
 INITS = ("templates", "mvnet")
+HEATS, FINALISTS = 3, 2  # iterations after which only so many hypotheses go on
 
 
 @dataclass(frozen=True)
@@ -91,8 +92,7 @@ class PoseEstimator:
             if not first:
                 continue
             masked = view.with_mask(detection.mask) if detection.mask is not None else view.with_mask(None)
-            poses = [h.T_cam_obj for h in first]
-            refined = refine(masked, self.model, poses, self.predictor, self.renderer, self.options.refine_options)
+            refined = self._refined(masked, [h.T_cam_obj for h in first])
             done = time.perf_counter()
             timings = {"first_pose": searched - started, "refine": done - searched, "total": done - started}
             estimates.append(self._choose(masked, refined, detection, timings))
@@ -105,6 +105,21 @@ class PoseEstimator:
         seconds = time.perf_counter() - started
         return self._choose(view, refined, None, {"refine": seconds, "total": seconds})
 
+    def _refined(self, view: View, starts: Sequence[Pose]) -> list[Refinement]:
+        """Every start for a few iterations, and the best of them to the end."""
+        options = self.options.refine_options
+        if len(starts) <= FINALISTS or options.iterations <= HEATS:
+            return refine(view, self.model, starts, self.predictor, self.renderer, options)
+        short = replace(options, iterations=HEATS)
+        heats = refine(view, self.model, starts, self.predictor, self.renderer, short)
+        order = np.argsort([-s for s in self._scores(view, heats)], kind="stable")
+        finalists = [heats[k] for k in order[:FINALISTS]]
+        there = [heat.converged and options.stop == "angle" for heat in finalists]
+        poses = [heat.T_cam_obj for heat, done in zip(finalists, there, strict=True) if not done]
+        rest = replace(options, iterations=options.iterations - HEATS)
+        ends = iter(refine(view, self.model, poses, self.predictor, self.renderer, rest))
+        return [heat if done else heat.then(next(ends)) for heat, done in zip(finalists, there, strict=True)]
+
     def first_poses(self, view: View, detection: Detection) -> list[Hypothesis]:
         """The first poses that ``options.init`` gives, best first."""
         if self._search is None:
@@ -115,9 +130,7 @@ class PoseEstimator:
         self, view: View, refined: Sequence[Refinement], detection: Detection | None, timings: dict[str, float]
     ) -> Estimate:
         """The hypothesis with the best score: a low predicted angle, and a silhouette that agrees with the mask."""
-        poses = [r.T_cam_obj for r in refined]
-        measured = agreements(view, self.model, poses, self.renderer, self.predictor.size)
-        scores = [score(r.angle, agreement) for r, agreement in zip(refined, measured, strict=True)]
+        scores = self._scores(view, refined)
         k = int(np.argmax(scores))
         best = refined[k]
         return Estimate(
@@ -132,6 +145,11 @@ class PoseEstimator:
             trace=best.trace,
             timings=timings,
         )
+
+    def _scores(self, view: View, refined: Sequence[Refinement]) -> list[float]:
+        poses = [r.T_cam_obj for r in refined]
+        measured = agreements(view, self.model, poses, self.renderer, self.predictor.size)
+        return [score(r.angle, agreement) for r, agreement in zip(refined, measured, strict=True)]
 
     def _box(self, view: View, T_cam_obj: Pose) -> Box:
         points = T_cam_obj.apply(self.model.outline)

@@ -1,14 +1,15 @@
 """The loop: zoom, render, predict, update; it keeps a trace. Layer 3.
 
 Paper, section 3.3: the pose is updated until SV-Net's own predicted angle falls below 2 degrees; where that does not
-happen within 50 iterations, the iterate with the lowest predicted angle wins. DeepIM's fixed number of iterations
-is the other policy.
+happen within 50 iterations, the iterate with the lowest predicted angle wins. A loop whose predicted angle has not
+fallen for some time ends earlier, which changes almost nothing (docs/decisions/0005). DeepIM's fixed number of
+iterations is the other policy.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,23 +33,25 @@ STOPS = ("angle", "fixed")
 class RefineOptions:
     """update: what moves the pose, the regressed delta or the correspondences through PnP.
     stop: ``angle`` (the paper's policy) or ``fixed`` (DeepIM's). iterations: at most, or exactly.
-    stop_angle: radians. last_update: also apply the update predicted for the pose that ended the loop."""
+    stop_angle: radians. last_update: also apply the update predicted for the pose that ended the loop. patience: with
+    ``angle``, how many iterations may pass without a new lowest predicted angle."""
 
     update: str = "correspondence"
     stop: str = "angle"
     iterations: int = 50
     stop_angle: float = float(np.deg2rad(2.0))
     last_update: bool = True
+    patience: int = 8
 
     def __post_init__(self) -> None:
         if self.update not in UPDATES or self.stop not in STOPS:
             raise ConfigError(
                 f"update is one of {UPDATES} and stop one of {STOPS}, not {self.update!r}, {self.stop!r}."
             )
-        if self.iterations < 1 or not 0 < self.stop_angle <= np.pi:
+        if min(self.iterations, self.patience) < 1 or not 0 < self.stop_angle <= np.pi:
             raise ConfigError(
-                f"iterations must be at least 1 and the stop angle between 0 and 180 degrees, not {self.iterations} "
-                f"and {np.rad2deg(self.stop_angle):g}."
+                f"iterations and patience must be at least 1 and the stop angle between 0 and 180 degrees, not "
+                f"{self.iterations}, {self.patience} and {np.rad2deg(self.stop_angle):g}."
             )
 
 
@@ -61,6 +64,11 @@ class Refinement:
     iterations: int
     converged: bool
     trace: tuple[Step, ...]
+
+    def then(self, later: Refinement) -> Refinement:
+        """This one and what followed when it went on from its pose."""
+        iterations = self.iterations + later.iterations
+        return replace(later, iterations=iterations, trace=self.trace + later.trace)
 
 
 def refine(
@@ -155,7 +163,14 @@ class _Loop:
         if options.stop == "angle" and angle < options.stop_angle:
             self.done = self.converged = True
             return
+        if options.stop == "angle" and len(self.steps) - self._lowest() > options.patience:
+            self.done = True
+            return
         self.pose = updated
+
+    def _lowest(self) -> int:
+        """The step with the lowest predicted angle."""
+        return int(np.argmin([step.angle for step in self.steps]))
 
     def finish(self, options: RefineOptions) -> Refinement:
         if options.stop == "fixed":
@@ -164,7 +179,7 @@ class _Loop:
         elif self.converged:
             best = len(self.steps) - 1
         else:
-            best = int(np.argmin([step.angle for step in self.steps]))
+            best = self._lowest()
         pose = self.after[best] if options.last_update else self.steps[best].T_cam_obj
         return Refinement(pose, self.steps[best].angle, len(self.steps), self.converged, tuple(self.steps))
 

@@ -113,6 +113,9 @@ def _told(about: Mapping[str, Any]) -> str:
     """What the weights' TOML says of their training and figures, in one line."""
     parts = []
     for key, value in about.items():
+        if isinstance(value, list):
+            parts.append(f"{key.replace('_', ' ')} {len(value)}")
+            continue
         text = (
             f"({_told(value)})" if isinstance(value, Mapping) else f"{value:.4g}" if isinstance(value, float) else value
         )

@@ -73,6 +73,7 @@ def evaluate(
         None if weights is None else weights.digest,
         None if weights is None else options.preset,
         None if weights is None else str(about.get("trained_on", "")) or None,
+        frozenset(about["seen"]) if "seen" in about else None,
     )
     folder = RunFolder(out, _identity(options, source, csv), force)
     if options.stage == "score":
@@ -242,7 +243,7 @@ def _results(
     notes: Mapping[str, Any],
 ) -> dict[str, Any]:
     ids = sorted({c.obj_id for c in scored.cases})
-    objects = {o: {"novelty": table.novelty(source.trained_on, data.model(o).name)} for o in ids}
+    objects = {o: {"novelty": table.novelty(source.seen, data.model(o).digest)} for o in ids}
     results: dict[str, Any] = {
         "schema": table.SCHEMA,
         "posekit": __version__,

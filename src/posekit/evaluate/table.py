@@ -31,7 +31,8 @@ PAPER_MEASURES = ("2deg_2cm", "5deg_5cm", "10deg_10cm", "add_01d")
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where results come from. weights: their hash, None where nothing was computed. trained_on: of the weights."""
+    """Where results come from. weights: their hash, None where nothing was computed. trained_on: of the weights.
+    seen: digests of the meshes that they were trained on, None where that is not known."""
 
     command: str
     commit: str
@@ -39,6 +40,7 @@ class Provenance:
     weights: str | None = None
     preset: str | None = None
     trained_on: str | None = None
+    seen: frozenset[str] | None = None
 
 
 def commit() -> str:
@@ -68,14 +70,11 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def novelty(trained_on: str | None, mesh: str) -> str:
-    """Whether an object was in the training, by what the weights say: "seen", "novel" or "unknown"."""
-    if trained_on is None:
+def novelty(seen: frozenset[str] | None, digest: str) -> str:
+    """Whether a mesh was in the training, by the digests that the weights name: "seen", "novel" or "unknown"."""
+    if seen is None:
         return "unknown"
-    names = trained_on.removeprefix("renderings of ").replace(" and more", "").split(", ")
-    if mesh in names:
-        return "seen"
-    return "unknown" if "and more" in trained_on or "BOP" in trained_on else "novel"
+    return "seen" if digest in seen else "novel"
 
 
 def summarise(scored: Scored, info: DatasetInfo, objects: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:

@@ -12,7 +12,8 @@ from torch import Tensor, nn
 class Prediction:
     """What SV-Net (or MV-Net) says about B pairs.
 
-    quat_wxyz: (B, 4), not normalised. v: (B, 3), as in PoseDelta. angle: (B,), radians, None for MV-Net.
+    quat_wxyz: (B, 4), not normalised. v: (B, 3), as in PoseDelta. angle: (B,), radians, unbounded, None
+    for MV-Net.
     Dense head (lite only), on a grid of h x w anchors, every 4th pixel from (2, 2) on:
     flow: (B, 2, h, w) crop pixels from the rendered to the observed place; log_scale: (B, h, w), the
     logarithm of the flow's Laplace scale in pixels; visibility: (B, h, w), a logit.
@@ -35,8 +36,9 @@ def compress_angle(angle: Tensor) -> Tensor:
 
 
 def expand_angle(value: Tensor) -> Tensor:
-    """The inverse of ``compress_angle``, kept within [0, pi]."""
-    return (torch.expm1(value.clamp(0.0, 6.0)) * ANGLE_KNEE).clamp(0.0, torch.pi)
+    """The inverse of ``compress_angle``, for any answer of a head: below zero for negative ones, so that a loss on it
+    has a gradient everywhere (up to 14 radians). Bound it to [0, pi] where it is used."""
+    return torch.expm1(value.clamp(max=6.0)) * ANGLE_KNEE
 
 
 class PoseHeads(nn.Module):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -96,4 +97,4 @@ def unpack(arrays: Sequence[FArray | None], k: int, rendered: View) -> PairPredi
             scale_px=np.exp(log_scale[k][rows, columns].astype(np.float64)),
             visible=1 / (1 + np.exp(-visibility[k][rows, columns].astype(np.float64))),
         )
-    return PairPrediction(delta, float(angle[k]), found)
+    return PairPrediction(delta, min(max(float(angle[k]), 0.0), math.pi), found)

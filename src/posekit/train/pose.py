@@ -114,7 +114,8 @@ def make_networks(config: TrainConfig) -> tuple[Networks, frozenset[str]]:
             _load_flownets(networks, Path(config.sources.flownets))
         return networks, frozenset({"svnet", "mvnet"})
     networks = load_networks(config.recipe, None if init == "shipped" else Path(init))
-    networks = dataclasses.replace(networks, about={"init": networks.digest, "version": __version__})
+    kept = {key: networks.about[key] for key in ("trained_on", "seen") if key in networks.about}
+    networks = dataclasses.replace(networks, about={"init": networks.digest, "version": __version__, **kept})
     if networks.mvnet is not None:
         return networks, frozenset()
     if isinstance(networks.svnet, LiteSVNet):

@@ -22,25 +22,41 @@ MESHES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 @dataclass(frozen=True, eq=False)
 class Sources:
     """models: the meshes to render; none = procedural ones. photos: backgrounds. bop: data sets with their weights.
-    validation: a data set to measure on. about: a line for the weights' description."""
+    validation: a data set to measure on. folders: where models came from, with how many each."""
 
     models: list[ObjectModel]
     photos: list[NDArray[np.uint8]]
     bop: list[tuple[BopDataset, float]]
     validation: BopDataset | None
+    folders: tuple[tuple[str, int], ...] = ()
+
+    def about(self, share: float) -> str:
+        """A line for the weights' description. share: of samples that show the models."""
+        given = self.models[: len(self.models) - sum(count for _, count in self.folders)]
+        parts = [", ".join(m.name for m in given)] if given else []
+        parts += [f"{count} meshes of {name}" for name, count in self.folders]
+        told = [f"photographs of {data.root.name}" for data, _ in self.bop]
+        if parts and share > 0:
+            told.append("renderings of " + ", ".join(parts))
+        if (not self.models and not self.bop) or (self.models and share < 1):
+            told.append("procedural shapes" + (f" ({1 - share:.0%})" if self.models else ""))
+        return "; ".join(told)
 
     @property
-    def about(self) -> str:
-        meshes = [m.name for m in self.models]
-        shown = ", ".join(meshes[:8]) + (" and more" if len(meshes) > 8 else "")
-        return f"renderings of {shown}" if meshes else "procedural shapes"
+    def seen(self) -> set[str]:
+        """The digests of all meshes that a training sees."""
+        shown = [m for data, _ in self.bop for m in map(data.model, data.model_ids())]
+        return {m.digest for m in [*self.models, *shown]}
 
 
 def read_sources(config: SourceConfig) -> Sources:
     """Raises MeshError, InputError or ConfigError where something is missing or cannot be read."""
     models = [ObjectModel.load(path, units=config.units) for path in config.models]
+    folders = []
     for folder in config.meshes:
-        models += _meshes(Path(folder), config.units)
+        found = _meshes(Path(folder), config.units)
+        models += found
+        folders.append((Path(folder).name, len(found)))
     backgrounds = Path(config.backgrounds) if config.backgrounds else None
     if backgrounds is not None and not backgrounds.is_dir():
         raise ConfigError(f"there is no folder of backgrounds {backgrounds}.")
@@ -48,7 +64,7 @@ def read_sources(config: SourceConfig) -> Sources:
     if backgrounds is not None and not photos:
         raise ConfigError(f"the folder {backgrounds} holds no JPEG, PNG or WebP pictures for backgrounds.")
     validation = BopDataset(config.validate_on) if config.validate_on else None
-    return Sources(models, photos, [_weighted(text) for text in config.bop], validation)
+    return Sources(models, photos, [_weighted(text) for text in config.bop], validation, tuple(folders))
 
 
 def _meshes(folder: Path, units: str) -> list[ObjectModel]:

@@ -52,7 +52,11 @@ class PoseTask:
         return {"score": found.get("bop_add", found.get("add", 0.0)), **found}
 
     def export(self, nets: nn.Module, out: Path, about: Mapping[str, Any]) -> None:
-        about = {**self.networks.about, **about, "trained_on": self.sources.about}
+        before = self.networks.about  # of the weights that the training started from, where it did
+        own = self.sources.about(self.config.stream.share)
+        trained_on = f"{before['trained_on']}; then {own}" if before.get("trained_on") else own
+        seen = sorted({*before.get("seen", ()), *self.sources.seen})
+        about = {**before, **about, "trained_on": trained_on, "seen": seen}
         save_networks(out / self.networks.preset, self._with(nets), about)
 
     def _with(self, nets: nn.Module) -> Networks:
