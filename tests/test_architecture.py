@@ -36,7 +36,7 @@ DOORS = {
     "typer": {"cli"},
     "rich": {"cli"},
     "huggingface_hub": {"data"},
-    "pycocotools": {"evaluate"},
+    "pycocotools": {"detect"},
 }
 
 ROOM_LAYER = {room: layer for layer, rooms in LAYERS.items() for room in rooms}

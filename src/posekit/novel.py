@@ -39,9 +39,10 @@ MARGIN = 1.1
 @dataclass(frozen=True)
 class NovelOptions:
     """proposals: of a picture at most. least_proposal: their least score. least: the least score of a detection. most:
-    detections of a mesh. features: weight of the features against the templates. chroma: difference of the median a and
-    b (CIELAB, 8 bits) at which a score falls to 1/e. objectness: power of the proposal's own score. views: pictures
-    of a mesh whose features are kept. overlap: intersection over union from which two detections are of one instance."""
+    detections of a mesh. features: weight of the features against the templates. chroma: difference of the median a
+    and b (CIELAB, 8 bits) at which a score falls to 1/e. objectness: power of the proposal's own score. views: pictures
+    of a mesh whose features are kept. overlap: intersection over union from which two detections are of one instance.
+    """
 
     proposals: int = 40
     least_proposal: float = 0.1

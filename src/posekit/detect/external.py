@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from posekit.camera import Box, mask_box
-from posekit.detect.coco import decode, encode, xywh
 from posekit.detect.prompts import clip_box
+from posekit.detect.segmentation import decode, encode, xywh
 from posekit.errors import PromptError
 from posekit.object_model import ObjectModel
 from posekit.results import Detection
@@ -43,6 +43,7 @@ class DetectionsFile:
         try:
             entries, names, files = _parts(data)
             pictures = {entry["image_id"] for entry in entries}
+            _ = [int(entry["category_id"]) for entry in entries]  # every entry has one
             own = _image_number(image, files)
             if own in pictures or len(pictures) > 1 or (own is not None and own in files):
                 entries = [entry for entry in entries if entry["image_id"] == own]
