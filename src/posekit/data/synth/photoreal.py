@@ -6,10 +6,7 @@ the depth of what is not an object is Mitsuba's.
 
 from __future__ import annotations
 
-import ctypes.util
-import glob
 import os
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,14 +76,13 @@ def find_llvm() -> str | None:
     given = os.environ.get("DRJIT_LIBLLVM_PATH")
     if given:
         return given
+    folders = [*Path("/usr/lib").glob("*-linux-gnu"), Path("/usr/lib64"), Path("/usr/local/lib")]
     for version in LIBLLVM:
-        found = sorted(glob.glob(f"/usr/lib/*/libLLVM*{version}*.so*") + glob.glob(f"/usr/lib/llvm-{version}/lib/libLLVM*.so*"))
-        found = [path for path in found if re.search(rf"libLLVM[-.]({version}\b|so\.{version}\b)", path)]
-        if found:
-            return found[0]
-        name = ctypes.util.find_library(f"LLVM-{version}")
-        if name:
-            return name
+        for folder in (*folders, Path(f"/usr/lib/llvm-{version}/lib")):
+            for name in (f"libLLVM.so.{version}.*", f"libLLVM-{version}.so*"):
+                found = sorted(folder.glob(name))
+                if found:
+                    return str(found[0])
     return None
 
 
@@ -186,7 +182,7 @@ class Photoreal:
         mi, (name, vertices, normals, faces, uvs, colours, texture) = self.mi, self.meshes[obj_id]
         colour: dict[str, Any] = {"type": "rgb", "value": [0.3, 0.3, 0.3]}
         if texture is not None:
-            colour = {"type": "bitmap", "bitmap": mi.Bitmap(texture), "raw": False}
+            colour = {"type": "bitmap", "bitmap": mi.Bitmap(np.array(texture)), "raw": False}
         elif colours is not None:
             colour = {"type": "mesh_attribute", "name": "vertex_color"}
         properties = mi.Properties()
@@ -222,12 +218,10 @@ class Photoreal:
 
     def _material(self, rng: Rng) -> dict[str, Any]:
         """Wood, stone, cloth or paint by chance; with photographs also one of these."""
-        if self.backdrops.paths and rng.random() < 0.25:
-            picture = self.backdrops.draw(rng, (512, 512))
-        else:
-            picture = _grain(rng)
+        from_photo = bool(self.backdrops.paths) and rng.random() < 0.25
+        picture = self.backdrops.draw(rng, (512, 512)) if from_photo else _grain(rng)
         repeat = float(rng.uniform(0.8, 3.0))
-        bitmap = {"type": "bitmap", "bitmap": self.mi.Bitmap(picture), "raw": False, "wrap_mode": "mirror",
+        bitmap = {"type": "bitmap", "bitmap": self.mi.Bitmap(np.array(picture)), "raw": False, "wrap_mode": "mirror",
                   "to_uv": self.mi.ScalarTransform3f().scale([repeat, repeat])}  # fmt: skip
         return _surface(bitmap, rng)
 
@@ -259,7 +253,7 @@ class Photoreal:
 
     def _view(self, scene: Any, room: Room, rng: Rng) -> Picture:
         camera = Camera.from_fov(float(np.deg2rad(rng.uniform(32, 58))), *self.config.size)
-        T_cam_world, distance = _look(room, camera, rng)
+        T_cam_world, distance = _look(room, rng)
         linear = self._trace(scene, camera, T_cam_world, distance, room.unit, rng)
         image = develop(linear, rng)
         ground = self._depth(scene, camera, T_cam_world)
@@ -271,9 +265,9 @@ class Photoreal:
 
     def _trace(self, scene: Any, camera: Camera, T_cam_world: Pose, focus: float, unit: float, rng: Rng) -> Array:
         """Linear colours (H, W, 3), denoised."""
-        mi = self.mi
+        mi, aperture = self.mi, float(unit * rng.uniform(0.002, 0.03))
         sensor = self._sensor(camera, T_cam_world, {
-            "type": "thinlens", "focus_distance": float(focus), "aperture_radius": float(unit * rng.uniform(0.002, 0.03)),
+            "type": "thinlens", "focus_distance": float(focus), "aperture_radius": aperture,
         })  # fmt: skip
         integrator = mi.load_dict({
             "type": "aov", "aovs": "albedo:albedo,normal:sh_normal",
@@ -311,14 +305,15 @@ def _mesh_data(model: ObjectModel) -> tuple[Any, ...]:
     colours = None if model.colors is None else _linear(model.colors).astype(np.float32)
     uvs = None
     if model.uvs is not None:
-        uvs = model.uvs.astype(np.float32) * np.float32([1, -1]) + np.float32([0, 1])  # v down
+        uvs = (model.uvs * [1.0, -1.0] + [0.0, 1.0]).astype(np.float32)  # v down
     return model.name, model.vertices.astype(np.float64), model.normals, model.faces, uvs, colours, model.texture
 
 
 def _surface(colour: dict[str, Any], rng: Rng) -> dict[str, Any]:
     return {"type": "twosided", "bsdf": {
         "type": "principled", "base_color": colour, "roughness": float(rng.uniform(0.25, 0.95)),
-        "specular": float(rng.uniform(0.1, 0.6)), "metallic": float(rng.uniform(0.3, 0.8) if rng.random() < 0.06 else 0),
+        "specular": float(rng.uniform(0.1, 0.6)),
+        "metallic": float(rng.uniform(0.3, 0.8)) if rng.random() < 0.06 else 0.0,
     }}  # fmt: skip
 
 
@@ -329,7 +324,7 @@ def _linear(colours: NDArray[np.uint8]) -> Array:
 
 def _grain(rng: Rng, size: int = 512) -> NDArray[np.uint8]:
     """Wood, planks, tiles, stone or plain paint, uint8 (size, size, 3)."""
-    base = random_colour(rng) * 0.5 + np.array([110, 100, 90]) * 0.5
+    base = random_colour(rng) * 0.3 + np.array([125, 115, 105]) * 0.7
     fine = noise_image(rng, (size, size), 1)[..., 0] - 0.5
     kind = rng.choice(["wood", "tiles", "stone", "paint"], p=[0.35, 0.2, 0.2, 0.25])
     u, v = np.meshgrid(np.linspace(0, 1, size), np.linspace(0, 1, size))
@@ -340,9 +335,7 @@ def _grain(rng: Rng, size: int = 512) -> NDArray[np.uint8]:
         value = (1 + 0.3 * (rings - 0.5) + 0.2 * fine) * boards
     elif kind == "tiles":
         n = int(rng.integers(3, 9))
-        joint = (np.minimum(np.abs(u * n % 1 - 0.5), np.abs(v * n % 1 - 0.5)) > -1) & (
-            (np.abs(u * n % 1 - 0.5) > 0.47) | (np.abs(v * n % 1 - 0.5) > 0.47)
-        )
+        joint = (np.abs(u * n % 1 - 0.5) > 0.47) | (np.abs(v * n % 1 - 0.5) > 0.47)
         shade = rng.uniform(0.75, 1.1, size=(n + 1, n + 1))[(v * n).astype(int), (u * n).astype(int)]
         value = np.where(joint, 0.55, shade) * (1 + 0.15 * fine)
     elif kind == "stone":
@@ -378,7 +371,7 @@ def _environments(folder: str) -> list[Path]:
     return found
 
 
-def _look(room: Room, camera: Camera, rng: Rng) -> tuple[Pose, float]:
+def _look(room: Room, rng: Rng) -> tuple[Pose, float]:
     """``T_cam_world`` and the distance of what is in focus: the camera looks at one of the objects, from above."""
     _, model, pose = room.objects[int(rng.integers(len(room.objects)))]
     target = pose.apply(model.center) + rng.normal(size=3) * 0.25 * room.unit
@@ -395,7 +388,7 @@ def denoise(picture: NDArray[np.float32]) -> Array:
     import mitsuba_oidn
 
     colour, albedo, normals = (np.ascontiguousarray(picture[..., k : k + 3], np.float32) for k in (0, 3, 6))
-    result = mitsuba_oidn.denoise(colour, albedo=albedo.clip(0, 1), normals=normals, hdr=True)
+    result = mitsuba_oidn.denoise(colour, albedo=albedo.clip(0, 1), normal=normals, hdr=True)
     return np.asarray(result, dtype=np.float64)
 
 

@@ -128,8 +128,8 @@ def _on_ray(machines: Machines, root: Path, jobs: Sequence[list[int]]) -> Iterat
         raise ConfigError("--ray needs the extra: pip install 'posekit[ray]'.") from error
     local = machines.ray == "local"
     try:
-        ray.init(address=None if local else machines.ray, num_cpus=machines.workers if local else None,
-                 include_dashboard=False if local else None, log_to_driver=False, logging_level=logging.ERROR)  # fmt: skip
+        options = {"num_cpus": machines.workers, "include_dashboard": False} if local else {"address": machines.ray}
+        ray.init(**options, log_to_driver=False, logging_level=logging.ERROR)
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise ConfigError(f"--ray {machines.ray}: no Ray cluster answers there: {error}") from error
     try:
