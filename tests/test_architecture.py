@@ -18,8 +18,8 @@ LAYERS = {
     1: {"view", "object_model", "results"},
     2: {"load", "zoom", "metrics", "pnp", "render", "nets", "detect", "draw"},
     3: {"data", "refine", "hypotheses", "figures"},
-    4: {"estimate"},
-    5: {"track", "evaluate", "train"},
+    4: {"estimate", "novel"},
+    5: {"search", "track", "evaluate", "train"},
     6: {"cli"},
     7: {"__main__"},
 }
@@ -36,7 +36,7 @@ DOORS = {
     "typer": {"cli"},
     "rich": {"cli"},
     "huggingface_hub": {"data"},
-    "pycocotools": {"evaluate"},
+    "pycocotools": {"detect"},
 }
 
 ROOM_LAYER = {room: layer for layer, rooms in LAYERS.items() for room in rooms}

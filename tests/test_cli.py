@@ -307,7 +307,6 @@ BAD_INPUT: list[tuple[str, str, Callable[[Path, Path], object], tuple[str, ...]]
     ("a box beside", "box", lambda *_: "700,10,720,30", ("box 700,10,720,30", "outside", "640x480")),
     ("a box inside out", "box", lambda *_: "300,200,100,100", ("box 300,200,100,100", "inside out")),
     ("no box", "box", lambda *_: "here", ("'here'", "x0,y0,x1,y1")),
-    ("neither box nor mask", "box", lambda *_: None, ("--box", "--mask")),
     ("box and mask", "mask", lambda _, good: good / "mask.png", ("--box and --mask",)),
     ("a camera of zeros", "camera", lambda *_: "0,0,0,0", ("focal length", "positive")),
     ("K of zeros", "camera", lambda d, _: text(d / "K.json", str([[0, 0, 0]] * 3)), ("K.json", "focal length")),

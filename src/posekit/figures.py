@@ -11,7 +11,7 @@ from posekit.draw import Image
 from posekit.geometry import Pose
 from posekit.object_model import ObjectModel
 from posekit.render import Renderer
-from posekit.results import Estimate
+from posekit.results import Detection, Estimate
 from posekit.view import View
 from posekit.zoom import zoom_to_box
 
@@ -35,6 +35,20 @@ def overlay(renderer: Renderer, model: ObjectModel, view: View, estimates: Seque
     width = max(_SIDES[0], picture.shape[1])
     strips = [strip(renderer, model, view, estimate, width) for estimate in estimates]
     return draw.stack([picture, *strips])
+
+
+def detections_overlay(view: View, detections: Sequence[Detection]) -> Image:
+    """The photograph with each detection's outline and box, and a line that names them, best first."""
+    shown = _display_size(view)
+    scale = shown.camera.width / view.camera.width
+    picture = shown.image
+    for found in detections:
+        if found.mask is not None:
+            picture = draw.contour(picture, draw.fit(found.mask.astype(np.uint8), shown.camera.size) > 0)
+        x0, y0, x1, y1 = (scale * v for v in found.box)
+        picture = draw.box(picture, (x0, y0, x1, y1))
+    names = ", ".join(f"{d.label or 'object'} {d.score:.2f}" for d in detections[:8])
+    return draw.caption(picture, names or "nothing found")
 
 
 def strip(renderer: Renderer, model: ObjectModel, view: View, estimate: Estimate, width: int) -> Image:

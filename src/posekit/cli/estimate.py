@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,13 +12,15 @@ from posekit.cli.options import (
     LOOP,
     BoxOption,
     CameraOption,
+    DetectionsOption,
+    DetectorOption,
     ForceOption,
     ImageArgument,
     IterationsOption,
     JsonOption,
     MaskFromOption,
     MaskOption,
-    ModelOption,
+    ModelsOption,
     OutOption,
     PresetOption,
     SeedOption,
@@ -30,19 +33,37 @@ from posekit.cli.options import (
     WeightsOption,
 )
 
+CANDIDATES = 3  # detections of a mesh that are estimated at least, of which the best estimate is kept
+
 InitOption = Annotated[
     Literal["templates", "mvnet"], typer.Option(help="Where first poses come from.", rich_help_panel=LOOP)
 ]
 HypothesesOption = Annotated[int, typer.Option(metavar="K", help="First poses to refine.", rich_help_panel=LOOP)]
+InstancesOption = Annotated[
+    int, typer.Option(min=1, metavar="N", help="Of each mesh at most, where it is looked for.", rich_help_panel=LOOP)
+]
+LeastOption = Annotated[
+    float | None,
+    typer.Option(
+        min=0,
+        max=1,
+        help="Least score of an estimate; by default 0 where you say where the object is, else that of --detector.",
+        rich_help_panel=LOOP,
+    ),
+]
 
 
 def estimate(
     image: ImageArgument,
-    model: ModelOption,
+    model: ModelsOption,
     camera: CameraOption = None,
     box: BoxOption = None,
     mask: MaskOption = None,
     mask_from: MaskFromOption = "grabcut",
+    detections: DetectionsOption = None,
+    detector: DetectorOption = None,
+    instances: InstancesOption = 1,
+    least: LeastOption = None,
     units: UnitsOption = "auto",
     symmetry: SymmetryOption = None,
     preset: PresetOption = "lite",
@@ -59,22 +80,41 @@ def estimate(
     force: ForceOption = False,
     json: JsonOption = None,
 ) -> None:
-    """Estimate an object's pose in a photograph, from its mesh and a box or a mask."""
+    """Estimate objects' poses in a photograph, from their meshes. A box, a mask or detections help, but need not be."""
     from posekit.cli.output import Destination
 
     destination = Destination.chosen(out, Path("posekit-out") / image.stem, force, json)
 
-    from posekit.cli.prompts import detector_for
+    from posekit.cli.prompts import make_detector, prompt_for
     from posekit.estimate import EstimateOptions, PoseEstimator
     from posekit.load import load_view
     from posekit.object_model import ObjectModel
+    from posekit.search import SearchOptions, estimate_instances
 
     options = EstimateOptions(init, hypotheses, update, stop, iterations, stop_angle, seed)
     view = load_view(image, camera)
-    mesh = ObjectModel.load(model, units=units, symmetry=symmetry)
-    detections = detector_for(box, mask, mask_from).detect(view, [mesh])
+    meshes = [ObjectModel.load(path, units=units, symmetry=symmetry) for path in model]
+    finder = prompt_for(box, mask, mask_from, detections, image)
+    asked = finder is not None
+    if finder is None:
+        with destination.working("loading the detector"):
+            finder, _ = make_detector(detector, meshes, most=max(CANDIDATES, instances + 1), threads=threads)
+    with destination.working("detecting"):
+        found = finder.detect(view, meshes)
     with destination.working("loading the networks"):
-        estimator = PoseEstimator(mesh, preset=preset, weights=weights, options=options, threads=threads)
+        estimators = [
+            PoseEstimator(mesh, preset=preset, weights=weights, options=options, threads=threads) for mesh in meshes
+        ]
+    search = SearchOptions() if not asked else SearchOptions.given(box is not None or mask is not None)
+    search = replace(search, instances=search.instances if asked else instances,
+                     least=search.least if least is None else least)  # fmt: skip
     with destination.working("estimating"):
-        estimates = estimator.estimate(view, detections)
-    destination.deliver(estimator, view, estimates, {"image": image, "mesh": model})
+        results = [
+            (
+                estimator,
+                estimate_instances(estimator, view, [d for d in found if d.label == estimator.model.name], search),
+            )
+            for estimator in estimators
+        ]
+    paths = [{"image": image, "mesh": path} for path in model]
+    destination.deliver_all(view, results, paths)

@@ -18,6 +18,10 @@ ImageArgument = Annotated[Path, typer.Argument(help="The photograph.", show_defa
 ModelOption = Annotated[
     Path, typer.Option("--model", "-m", metavar="MESH", help="PLY, OBJ, GLB or STL.", rich_help_panel=INPUT)
 ]
+ModelsOption = Annotated[
+    list[Path],
+    typer.Option("--model", "-m", metavar="MESH", help="PLY, OBJ, GLB or STL; repeat it.", rich_help_panel=INPUT),
+]
 UnitsOption = Annotated[
     Units, typer.Option(help="Of the mesh; auto decides by its diameter and says so.", rich_help_panel=INPUT)
 ]
@@ -44,6 +48,20 @@ BoxOption = Annotated[
 MaskOption = Annotated[
     Path | None,
     typer.Option(metavar="PNG", help="The object's mask, of the photograph's size.", rich_help_panel=INPUT),
+]
+DetectionsOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="JSON", help="Detections of another program, as BOP or COCO have them.", rich_help_panel=INPUT
+    ),
+]
+DetectorOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="novel|coco|FILE",
+        help="Who looks for the object where nothing else says where it is: novel (the default) needs no training.",
+        rich_help_panel=INPUT,
+    ),
 ]
 MaskFromOption = Annotated[MaskFrom, typer.Option(help="How a box becomes a mask.", rich_help_panel=INPUT)]
 

@@ -91,27 +91,41 @@ class Destination:
     def deliver(
         self, estimator: PoseEstimator, view: View, estimates: Sequence[Estimate], files: Mapping[str, Path]
     ) -> None:
-        """Print the estimates and write them: the result as JSON, and the overlay.
+        """`deliver_all` of one mesh. files: what they were made from, by name, for the result."""
+        self.deliver_all(view, [(estimator, estimates)], [files])
 
-        files: what they were made from, by name, for the result.
-        """
-        from posekit import draw
-        from posekit.figures import overlay
-
-        result = _result(estimator, view, estimates, files)
-        for estimate in estimates:
-            self.say(describe(estimate))
-        if not estimates:
-            self.say(f"no pose: nothing in the picture could be taken for {estimator.model.name}.")
+    def deliver_all(
+        self,
+        view: View,
+        results: Sequence[tuple[PoseEstimator, Sequence[Estimate]]],
+        files: Sequence[Mapping[str, Path]],
+    ) -> None:
+        """Print the estimates and write them: one result as JSON, and an overlay for each mesh. files: by mesh."""
+        for estimator, estimates in results:
+            for estimate in estimates:
+                self.say(describe(estimate))
+            if not estimates:
+                self.say(f"no pose: nothing in the picture could be taken for {estimator.model.name}.")
+        result = _result(view, results, files)
         if self.folder is not None:
-            picture = draw.png(overlay(estimator.renderer, estimator.model, view, estimates))
-            self.say(f"overlay: {self.folder.write('overlay.png', picture)}")
+            for name, data in _overlays(view, results):
+                self.say(f"overlay: {self.folder.write(name, data)}")
             self.say(f"result: {self.folder.write('result.json', result)}")
         if self.json == "-":
             typer.echo(result, nl=False)
         elif self.json is not None:
             write_text_atomic(Path(self.json), result)
             self.say(f"result: {self.json}")
+
+
+def _overlays(view: View, results: Sequence[tuple[PoseEstimator, Sequence[Estimate]]]) -> Iterator[tuple[str, bytes]]:
+    """Names of files and PNGs: overlay.png of one mesh; of several overlay-1-NAME.png and so on."""
+    from posekit import draw
+    from posekit.figures import overlay
+
+    for k, (estimator, estimates) in enumerate(results):
+        name = "overlay.png" if len(results) == 1 else f"overlay-{k + 1}-{estimator.model.name}.png"
+        yield name, draw.png(overlay(estimator.renderer, estimator.model, view, estimates))
 
 
 def describe(estimate: Estimate) -> str:
@@ -126,11 +140,17 @@ def describe(estimate: Estimate) -> str:
     )
 
 
-def _result(estimator: PoseEstimator, view: View, estimates: Sequence[Estimate], files: Mapping[str, Path]) -> str:
+def _result(
+    view: View, results: Sequence[tuple[PoseEstimator, Sequence[Estimate]]], files: Sequence[Mapping[str, Path]]
+) -> str:
+    """The entries of one mesh as they are; of several, ``mesh`` lists them."""
     camera = view.camera
+    about: dict[str, object] = dict(files[0])
+    if len(files) > 1:
+        about["mesh"] = [each["mesh"] for each in files]
     return estimates_to_json(
-        estimates,
-        weights_hash=estimator.weights_hash,
+        [estimate for _, estimates in results for estimate in estimates],
+        weights_hash=results[0][0].weights_hash,
         versions={name: version(name) for name in ("torch", "numpy", "opencv-python-headless", "moderngl")},
-        about={**files, "camera": {"K": camera.K, "width": camera.width, "height": camera.height}},
+        about={**about, "camera": {"K": camera.K, "width": camera.width, "height": camera.height}},
     )

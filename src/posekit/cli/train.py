@@ -187,3 +187,92 @@ def _bar() -> Iterator[Show]:
             bar.update(task, completed=progress.done, description=f"step {progress.step}, loss {loss:.3f}")
 
         yield show
+
+
+@train.command("detector")
+def detector(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the weights, curves and checkpoints.")],
+    models: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--models", "--model", "-m", metavar="MESH", help="What to find; repeat it.", rich_help_panel=SOURCES
+        ),
+    ] = None,
+    meshes: Annotated[
+        list[Path] | None, typer.Option(metavar="DIR", help="A folder of meshes.", rich_help_panel=SOURCES)
+    ] = None,
+    agnostic: Annotated[
+        bool, typer.Option("--agnostic", help="Objects of any kind, as one class.", rich_help_panel=SOURCES)
+    ] = False,
+    units: Annotated[Units, typer.Option(help="Of the meshes.", rich_help_panel=SOURCES)] = "auto",
+    backgrounds: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Photographs for backgrounds.", rich_help_panel=SOURCES)
+    ] = None,
+    init: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WEIGHTS|novel", help="A detector to start from; else ImageNet's backbone.", rich_help_panel=SOURCES
+        ),
+    ] = None,
+    backbone: Annotated[Literal["lite0", "resnet50"] | None, typer.Option(help="Light, or the paper's.")] = None,
+    config: Annotated[Path | None, typer.Option(metavar="TOML", help="Everything else; options override it.")] = None,
+    minutes: Annotated[float | None, typer.Option(help="Of wall clock.", rich_help_panel=SCHEDULE)] = None,
+    epochs: Annotated[int | None, typer.Option(help="Of 2000 scenes.", rich_help_panel=SCHEDULE)] = None,
+    steps: Annotated[int | None, typer.Option(help="Optimiser steps.", rich_help_panel=SCHEDULE)] = None,
+    batch: Annotated[int | None, typer.Option(help="Scenes per process and step.", rich_help_panel=SCHEDULE)] = None,
+    rate: Annotated[float | None, typer.Option(help="Highest learning rate.", rich_help_panel=SCHEDULE)] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="The same seed gives the same result.", rich_help_panel=SCHEDULE)
+    ] = None,
+    devices: Annotated[int | None, typer.Option(help="Processes on this machine.", rich_help_panel=MACHINE)] = None,
+    accelerator: Annotated[
+        Literal["auto", "cpu", "cuda"] | None, typer.Option(help="What computes.", rich_help_panel=MACHINE)
+    ] = None,
+    precision: Annotated[
+        Literal["32-true", "bf16-mixed", "16-mixed"] | None, typer.Option(help="Of numbers.", rich_help_panel=MACHINE)
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Processes that render, for each that trains.", rich_help_panel=MACHINE)
+    ] = None,
+    threads: Annotated[int | None, typer.Option(help="Threads of torch per process.", rich_help_panel=MACHINE)] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the training in --out, as it was begun.")
+    ] = False,
+    force: ForceOption = False,
+) -> None:
+    """Train Mask R-CNN on composed scenes: for your meshes, or with --agnostic for objects of any kind."""
+    from posekit.detect.maskrcnn import SHIPPED
+    from posekit.train.config import changed
+    from posekit.train.detector import default_config, read_config, resume_detector, train_detector
+
+    if resume:
+        with _bar() as show:
+            rows = resume_detector(out, show)
+    else:
+        chosen = read_config(config) if config is not None else default_config(backbone or "lite0")
+        timed = minutes is not None and steps is None and epochs is None
+        asked = {
+            "agnostic": agnostic or None, "minutes": minutes, "seed": seed,
+            "steps": 10**9 if timed else steps, "epochs": 0 if timed or steps is not None else epochs,
+            "optimiser": {"rate": rate},
+            "machine": {"devices": devices, "accelerator": accelerator, "precision": precision, "workers": workers,
+                        "threads": threads},
+            "stream": {"batch": batch},
+            "network": {"backbone": backbone},
+            "sources": {"models": _texts(models), "meshes": _texts(meshes), "units": units,
+                        "backgrounds": _text(backgrounds), "init": str(SHIPPED) if init == "novel" else init},
+        }  # fmt: skip
+        with _bar() as show:
+            rows = train_detector(changed(chosen, _given(asked), "the command line"), out, show, force)
+    if rows:
+        typer.echo(_detector_report(rows))
+        typer.echo(f"weights: {out}; use them with: posekit detect IMAGE --weights {out}")
+
+
+def _detector_report(rows: list[dict[str, str]]) -> str:
+    """Average precision before and after, for a person."""
+    before, after = rows[0], rows[-1]
+    names = (("box_ap", "box AP"), ("box_ap50", "box AP50"), ("mask_ap", "mask AP"), ("mask_ap50", "mask AP50"))
+    found = [f"{name} {100 * float(before[key]):.0f} -> {100 * float(after[key]):.0f}" for key, name in names]
+    minutes = float(after["seconds"]) / 60
+    return f"{after['step']} steps in {minutes:.1f} minutes; held-back scenes, before -> after: {', '.join(found)}"

@@ -108,8 +108,9 @@ def compose(
     distractors: Sequence[ObjectModel] = (),
     photos: Sequence[Image] = (),
 ) -> Tabletop:
-    """A random scene. objects: to draw from, with repetition. distractors: other meshes to draw from; their sizes are
-    changed to the objects'. Raises ConfigError where there are neither objects nor distractors."""
+    """A random scene. objects: to draw from, with repetition. distractors: other meshes to draw from, of about the
+    objects' sizes (see `procedural_objects` and `resized`). Raises ConfigError where there are
+    neither objects nor distractors."""
     if not len(objects) and not len(distractors):
         raise ConfigError("a scene needs meshes: pass objects or distractors.")
     unit = float(np.median([m.diameter for m in (objects or distractors)]))
@@ -140,6 +141,14 @@ def procedural_objects(count: int, rng: Rng, photos: Sequence[Image] = (), unit:
     """Random objects whose diameters scatter about ``unit`` metres as the things on a table do."""
     sizes = unit * np.exp(rng.normal(size=count) * 0.4).clip(0.4, 2.5)
     return [random_object(rng, photos, float(size)) for size in sizes]
+
+
+def resized(model: ObjectModel, diameter: float) -> ObjectModel:
+    """The same mesh with another diameter, metres."""
+    scale = np.float32(diameter / model.diameter)
+    return ObjectModel.from_arrays(
+        model.vertices * scale, model.faces, name=model.name, colors=model.colors, uvs=model.uvs, texture=model.texture
+    )
 
 
 def _chosen(

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from posekit.camera import Box
+from posekit.detect.segmentation import decode
 from posekit.errors import InputError
 from posekit.geometry import Pose
 
@@ -180,17 +181,10 @@ class FoundRegion:
 
     def mask(self) -> NDArray[np.bool_] | None:
         """bool (H, W), None where the file has none."""
-        return None if self.rle is None else decode_rle(self.rle)
-
-
-def decode_rle(rle: Mapping[str, Any]) -> NDArray[np.bool_]:
-    """COCO's run lengths, a list or a compressed text, as a mask (H, W)."""
-    from pycocotools import mask as coco
-
-    height, width = rle["size"]
-    counts = rle["counts"]
-    packed = coco.frPyObjects(dict(rle), height, width) if isinstance(counts, list) else dict(rle)
-    return np.asarray(coco.decode(packed), dtype=np.bool_)
+        if self.rle is None:
+            return None
+        height, width = self.rle["size"]
+        return decode(self.rle, (width, height))
 
 
 def read_detections(

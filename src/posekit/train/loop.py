@@ -30,12 +30,43 @@ from posekit.errors import ConfigError, TrainingError
 from posekit.files import write_text_atomic
 from posekit.nets.precision import has_fast_bfloat16
 from posekit.train.checkpoint import Checkpoint, Checkpoints, optimiser_tensors, part, restore_optimiser
-from posekit.train.config import OptimiserConfig, TrainConfig
+from posekit.train.config import MachineConfig, OptimiserConfig
 from posekit.train.log import Curves
 
 Batch = dict[str, Tensor]
 M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # malloc.h
 PROFILED = (3, 10)  # steps that --profile leaves out, and then records
+
+
+class Schedule(Protocol):
+    """What the loop needs to know of a training's configuration; `TrainConfig` says what each means."""
+
+    @property
+    def recipe(self) -> str: ...
+    @property
+    def steps(self) -> int: ...
+    @property
+    def minutes(self) -> float: ...
+    @property
+    def seed(self) -> int: ...
+    @property
+    def validate(self) -> int: ...
+    @property
+    def save(self) -> int: ...
+    @property
+    def log(self) -> int: ...
+    @property
+    def keep(self) -> int: ...
+    @property
+    def overfit(self) -> bool: ...
+    @property
+    def profile(self) -> bool: ...
+    @property
+    def optimiser(self) -> OptimiserConfig: ...
+    @property
+    def machine(self) -> MachineConfig: ...
+    @property
+    def world(self) -> int: ...
 
 
 class Task(Protocol):
@@ -97,7 +128,7 @@ def keep_memory() -> None:
         libc.mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
 
 
-def make_fabric(config: TrainConfig) -> Any:
+def make_fabric(config: Schedule) -> Any:
     """Lightning Fabric for the configured machines, launched: under torchrun, Slurm and so on as these say, else it
     starts this program again for each further process. Raises ConfigError where Fabric is not installed."""
     try:
@@ -129,7 +160,7 @@ def make_fabric(config: TrainConfig) -> Any:
     return fabric
 
 
-def make_optimiser(nets: nn.Module, config: TrainConfig) -> torch.optim.Optimizer:
+def make_optimiser(nets: nn.Module, config: Schedule) -> torch.optim.Optimizer:
     """Weight decay on weights only, neither on biases nor on norms."""
     chosen = config.optimiser
     weights = [p for p in nets.parameters() if p.ndim > 1]
@@ -147,7 +178,7 @@ def _show_nothing(progress: Progress) -> None:
 class Trainer:
     """One training in the folder ``out``. show: called after every step by the first process."""
 
-    def __init__(self, config: TrainConfig, task: Task, fabric: Any, out: Path, show: Show | None = None) -> None:
+    def __init__(self, config: Schedule, task: Task, fabric: Any, out: Path, show: Show | None = None) -> None:
         self.config, self.task, self.fabric, self.out = config, task, fabric, out
         self.show = show or _show_nothing
         self.first = fabric.global_rank == 0

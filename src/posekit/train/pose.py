@@ -36,8 +36,8 @@ def train_pose(config: TrainConfig, out: Path, show: Show | None = None, force: 
     Raises OutputError where the folder holds files and ``force`` is not given, ConfigError, MeshError, WeightsError,
     and what `Trainer.run` raises.
     """
-    if _is_first():
-        _claim(out, force)
+    if is_first():
+        claim(out, force)
     return _train(config, out, show)
 
 
@@ -144,12 +144,12 @@ def _load_flownets(networks: Networks, path: Path) -> None:
     networks.svnet.branch.encoder.load_flownets(nested)
 
 
-def _is_first() -> bool:
+def is_first() -> bool:
     """Whether this process was not started by another one of the same training."""
     return all(os.environ.get(name, "0") == "0" for name in ("RANK", "LOCAL_RANK", "NODE_RANK"))
 
 
-def _claim(out: Path, force: bool) -> None:
+def claim(out: Path, force: bool) -> None:
     if out.exists() and not out.is_dir():
         raise OutputError(f"{out} is a file: --out names a folder.")
     if out.is_dir() and any(out.iterdir()):

@@ -1,0 +1,85 @@
+"""``posekit detect``: where the objects are in a photograph."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from posekit.cli.options import (
+    INPUT,
+    OUTPUT,
+    CameraOption,
+    DetectorOption,
+    ForceOption,
+    ImageArgument,
+    OutOption,
+    ThreadsOption,
+    UnitsOption,
+)
+
+SCORES = "Detections"
+
+
+def detect(
+    image: ImageArgument,
+    model: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--model",
+            "-m",
+            metavar="MESH",
+            help="What to look for; repeat it. Without it anything is reported.",
+            rich_help_panel=INPUT,
+        ),
+    ] = None,
+    units: UnitsOption = "auto",
+    camera: CameraOption = None,
+    detector: DetectorOption = None,
+    weights: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="A trained detector; the same as --detector FILE.")
+    ] = None,
+    least: Annotated[float | None, typer.Option(min=0, max=1, help="Least score.", rich_help_panel=SCORES)] = None,
+    most: Annotated[int, typer.Option(min=1, help="Detections of a mesh at most (novel).", rich_help_panel=SCORES)] = 3,
+    threads: ThreadsOption = None,
+    scene: Annotated[
+        int | None, typer.Option(help="scene_id for BOP; by default the folder's number.", rich_help_panel=OUTPUT)
+    ] = None,
+    out: OutOption = None,
+    force: ForceOption = False,
+) -> None:
+    """Find objects in a photograph: boxes, masks and scores, as COCO and BOP JSON."""
+    from posekit.cli.output import OutputFolder
+    from posekit.cli.prompts import make_detector
+    from posekit.detect.external import to_bop, to_coco
+    from posekit.draw import png
+    from posekit.errors import ConfigError
+    from posekit.figures import detections_overlay
+    from posekit.load import load_view
+    from posekit.object_model import ObjectModel
+
+    if weights is not None and detector is not None:
+        raise ConfigError("--weights and --detector were both given, and mean the same: pass one of them.")
+    folder = OutputFolder(out or Path("posekit-out") / f"{image.stem}-detections", force)
+    view = load_view(image, camera)
+    meshes = [ObjectModel.load(path, units=units) for path in model or ()]
+    finder, classes = make_detector(
+        str(weights) if weights is not None else detector, meshes, least=least, most=most, threads=threads
+    )
+    started = time.perf_counter()
+    found = sorted(finder.detect(view, meshes), key=lambda d: -d.score)
+    seconds = time.perf_counter() - started
+    for detection in found:
+        typer.echo(
+            f"{detection.label or 'object'}: score {detection.score:.2f}, box "
+            + ",".join(f"{v:.0f}" for v in detection.box)
+        )
+    if not found:
+        names = ", ".join(m.name for m in meshes) or "an object"
+        typer.echo(f"nothing in the picture could be taken for {names}.")
+    typer.echo(f"{len(found)} detections in {seconds:.2f} s")
+    typer.echo(f"overlay: {folder.write('overlay.png', png(detections_overlay(view, found)))}")
+    typer.echo(f"COCO: {folder.write('coco.json', to_coco(found, classes, image, view.camera.size))}")
+    typer.echo(f"BOP: {folder.write('bop.json', to_bop(found, classes, image, seconds, scene))}")

@@ -1,0 +1,161 @@
+"""Detections in files: BOP's and COCO's JSON, to and from. Layer 2."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from posekit.camera import Box, mask_box
+from posekit.detect.prompts import clip_box
+from posekit.detect.segmentation import decode, encode, xywh
+from posekit.errors import PromptError
+from posekit.object_model import ObjectModel
+from posekit.results import Detection
+from posekit.view import View
+
+_FORMS = (
+    "a list of {image_id, category_id, score, bbox: [x, y, width, height], segmentation} as BOP and COCO results have "
+    "it, or COCO's {images, annotations, categories}"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class DetectionsFile:
+    """A Detector that reads what another program found. entries: of one picture; names: of categories, by number."""
+
+    entries: Sequence[Mapping[str, Any]]
+    names: Mapping[int, str]
+    label: str
+
+    @classmethod
+    def read(cls, path: Path, image: Path) -> DetectionsFile:
+        """The entries for a photograph: its number is the last one in its name, as BOP has it; a file about one picture
+        only is taken to be about this one. Raises PromptError."""
+        try:
+            data = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise PromptError(f"the detections {path} cannot be read ({error}): give {_FORMS}.") from error
+        try:
+            entries, names, files = _parts(data)
+            pictures = {entry["image_id"] for entry in entries}
+            _ = [int(entry["category_id"]) for entry in entries]  # every entry has one
+            own = _image_number(image, files)
+            if own in pictures or len(pictures) > 1 or (own is not None and own in files):
+                entries = [entry for entry in entries if entry["image_id"] == own]
+            return cls(entries, names, path.name)
+        except (KeyError, TypeError, AttributeError, ValueError) as error:
+            raise PromptError(f"{path} holds no detections ({error!r}): give {_FORMS}.") from error
+
+    def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
+        """Each model's detections by falling score. A category belongs to the model of its name, or of its number
+        (``obj_000005`` is 5); with one model and one category they belong together anyway. Raises PromptError."""
+        categories = {int(entry["category_id"]) for entry in self.entries}
+        found = []
+        for model in models:
+            wanted = {c for c in categories if self.names.get(c) == model.name or c == model_number(model.name)}
+            if not wanted and len(models) == 1 and len(categories) == 1:
+                wanted = categories
+            mine = [self._detection(e, view, model) for e in self.entries if int(e["category_id"]) in wanted]
+            found += sorted(mine, key=lambda d: -d.score)
+        return found
+
+    def _detection(self, entry: Mapping[str, Any], view: View, model: ObjectModel) -> Detection:
+        try:
+            score = float(entry.get("score", 1.0))
+            mask = decode(entry["segmentation"], view.camera.size) if entry.get("segmentation") else None
+            box = _box(entry["bbox"]) if "bbox" in entry else None
+        except (KeyError, TypeError, ValueError) as error:
+            raise PromptError(f"{self.label} has an entry that is no detection ({error!r}): give {_FORMS}.") from error
+        if mask is not None and not mask.any():
+            mask = None
+        if box is None:
+            box = mask_box(mask) if mask is not None else None
+        if box is None or not math.isfinite(score):
+            raise PromptError(f"{self.label} has a detection with neither box nor mask, or without a finite score.")
+        return Detection(clip_box(box, view.camera), mask, score, model.name, "file")
+
+
+def _parts(data: Any) -> tuple[list[Mapping[str, Any]], dict[int, str], dict[int, str]]:
+    """Entries, names of categories, and file names of pictures, by number."""
+    if isinstance(data, list):
+        return data, {}, {}
+    names = {int(c["id"]): str(c.get("name", "")) for c in data.get("categories", [])}
+    files = {int(i["id"]): str(i.get("file_name", "")) for i in data.get("images", [])}
+    return data["annotations"], names, files
+
+
+def _image_number(image: Path, files: Mapping[int, str]) -> int | None:
+    named = next((number for number, name in files.items() if Path(name).name == image.name), None)
+    digits = re.findall(r"\d+", image.stem)
+    return named if named is not None else int(digits[-1]) if digits else None
+
+
+def model_number(name: str) -> int | None:
+    """The number at the end of a mesh's name, as BOP numbers objects; None without one."""
+    found = re.search(r"(\d+)$", name)
+    return int(found[1]) if found else None
+
+
+def _box(values: Sequence[float]) -> Box:
+    x, y, width, height = (float(v) for v in values)
+    return x, y, x + width, y + height
+
+
+def categories_of(names: Sequence[str]) -> dict[str, int]:
+    """A number for each name: the one at its end where all have different ones, else 1, 2, 3 ..."""
+    numbers = [model_number(name) for name in names]
+    if None in numbers or len(set(numbers)) < len(numbers):
+        return {name: k + 1 for k, name in enumerate(names)}
+    return {name: number for name, number in zip(names, numbers, strict=True) if number is not None}
+
+
+def to_coco(detections: Sequence[Detection], names: Sequence[str], image: Path, size: tuple[int, int]) -> str:
+    """COCO's {images, annotations, categories}, annotations with scores. names: of all classes. size: (width,
+    height)."""
+    numbers = categories_of(names)
+    number = _image_number(image, {}) or 0
+    document = {
+        "images": [{"id": number, "file_name": image.name, "width": size[0], "height": size[1]}],
+        "categories": [{"id": number, "name": name} for name, number in numbers.items()],
+        "annotations": [
+            {"id": k + 1, "iscrowd": 0, "area": _area(d), **_entry(d, number, numbers)}
+            for k, d in enumerate(detections)
+        ],
+    }
+    return json.dumps(document, indent=1, allow_nan=False) + "\n"
+
+
+def to_bop(
+    detections: Sequence[Detection], names: Sequence[str], image: Path, seconds: float, scene: int | None = None
+) -> str:
+    """BOP's list of detections. seconds: of the whole picture. scene: the number of the folder above ``rgb`` where it
+    is not given, 0 where there is none."""
+    numbers = categories_of(names)
+    if scene is None:
+        folder = image.resolve().parent.parent.name
+        scene = int(folder) if folder.isdigit() else 0
+    number = _image_number(image, {}) or 0
+    entries = [{"scene_id": scene, **_entry(d, number, numbers), "time": seconds} for d in detections]
+    return json.dumps(entries, indent=1, allow_nan=False) + "\n"
+
+
+def _entry(detection: Detection, image: int, numbers: Mapping[str, int]) -> dict[str, Any]:
+    entry: dict[str, Any] = {
+        "image_id": image,
+        "category_id": numbers[detection.label or "object"],
+        "score": detection.score,
+        "bbox": xywh(detection.box),
+    }
+    return entry if detection.mask is None else entry | {"segmentation": encode(detection.mask)}
+
+
+def _area(detection: Detection) -> float:
+    if detection.mask is not None:
+        return float(detection.mask.sum())
+    x0, y0, x1, y1 = detection.box
+    return (x1 - x0) * (y1 - y0)

@@ -1,0 +1,265 @@
+"""Mask R-CNN (He et al., 2017), from torchvision: its shape, its weights on disk, and detection with it. Layer 2."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+import torch
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+from torch import Tensor, nn
+
+from posekit.detect.backbones import BACKBONES, feature_pyramid
+from posekit.detect.vision import torchvision
+from posekit.errors import ConfigError, WeightsError
+from posekit.files import write_bytes_atomic, write_text_atomic
+from posekit.object_model import ObjectModel
+from posekit.results import Detection
+from posekit.view import View
+
+KIND = "mask-rcnn"
+NOVEL = ("object",)  # the one class of a class-agnostic detector
+SHIPPED = Path(__file__).resolve().parent.parent / "weights" / "detector-novel"
+COCO = "coco"
+
+
+@dataclass(frozen=True)
+class MaskRCNNConfig:
+    """backbone: "lite0" or "resnet50". classes: names, without the ground. size: (width, height) that pictures are
+    fitted into in training. use_size: the same in use; small objects want it larger. channels: of the
+    pyramid. hidden: width of the box head. anchors: sides, one for each level of the pyramid, pixels. proposals:
+    regions kept in training and in use. samples: regions that the heads learn from in a picture."""
+
+    backbone: str = "lite0"
+    classes: tuple[str, ...] = NOVEL
+    size: tuple[int, int] = (320, 240)
+    use_size: tuple[int, int] = (480, 360)
+    channels: int = 64
+    hidden: int = 256
+    anchors: tuple[int, ...] = (16, 32, 64, 128)
+    proposals: tuple[int, int] = (120, 120)
+    samples: int = 48
+
+    def __post_init__(self) -> None:
+        if self.backbone not in BACKBONES:
+            raise ConfigError(f"the backbone is one of {', '.join(BACKBONES)}, not {self.backbone!r}.")
+        if not self.classes:
+            raise ConfigError("a detector needs at least one class.")
+
+    @property
+    def novel(self) -> bool:
+        """Whether it finds objects of any kind."""
+        return self.classes == NOVEL
+
+
+def paper_config(classes: Sequence[str]) -> MaskRCNNConfig:
+    """ResNet-50 with FPN as in the paper, at 640x480."""
+    return MaskRCNNConfig(
+        "resnet50", tuple(classes), (640, 480), (640, 480), 256, 1024, (32, 64, 128, 256, 512), (1000, 300), 256
+    )
+
+
+def build(config: MaskRCNNConfig, *, imagenet: bool = False) -> Any:
+    """The network (a torchvision MaskRCNN), its backbone from ImageNet weights or untrained."""
+    vision = torchvision()
+    detection = vision.models.detection
+    body = feature_pyramid(config.backbone, config.channels, imagenet=imagenet)
+    levels = [str(k) for k in range(4)]
+    count = len(config.classes) + 1
+    shapes = detection.anchor_utils.AnchorGenerator(
+        tuple((side,) for side in config.anchors), ((0.5, 1.0, 2.0),) * len(config.anchors)
+    )
+    align = vision.ops.MultiScaleRoIAlign
+    box_pool = align(levels, 7, 2, canonical_scale=_canonical(config))
+    mask_pool = align(levels, 14, 2, canonical_scale=_canonical(config))
+    wide = body.out_channels
+    layers = (wide,) * (2 if config.backbone == "lite0" else 4)
+    width, height = config.size
+    # TF's and torchvision's ImageNet weights were trained with their own means
+    lite = config.backbone == "lite0"
+    return detection.MaskRCNN(
+        body, min_size=min(width, height), max_size=max(width, height),
+        image_mean=[0.498] * 3 if lite else None, image_std=[0.502] * 3 if lite else None,
+        rpn_anchor_generator=shapes, rpn_pre_nms_top_n_train=3 * config.proposals[0], rpn_pre_nms_top_n_test=
+        3 * config.proposals[1], rpn_post_nms_top_n_train=config.proposals[0], rpn_post_nms_top_n_test=
+        config.proposals[1], rpn_batch_size_per_image=128,
+        box_roi_pool=box_pool,
+        box_head=detection.faster_rcnn.TwoMLPHead(wide * 49, config.hidden),
+        box_predictor=detection.faster_rcnn.FastRCNNPredictor(config.hidden, count),
+        box_batch_size_per_image=config.samples, box_detections_per_img=50, box_nms_thresh=0.5,
+        mask_roi_pool=mask_pool,
+        mask_head=detection.mask_rcnn.MaskRCNNHeads(wide, layers, 1),
+        mask_predictor=detection.mask_rcnn.MaskRCNNPredictor(wide, wide, count),
+    )  # fmt: skip
+
+
+def _canonical(config: MaskRCNNConfig) -> int:
+    """The size of a region that is pooled from stride 16: ImageNet's 224 pixels, less in smaller pictures."""
+    return 224 if config.backbone == "resnet50" else 112
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedDetector:
+    """A network with what it was made for. digest: of its weights; about: its training."""
+
+    config: MaskRCNNConfig
+    network: Any
+    digest: str = "untrained"
+    about: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+
+def save_detector(path: Path, config: MaskRCNNConfig, network: nn.Module, about: Mapping[str, Any]) -> str:
+    """Write ``path``.safetensors in fp16 and ``path``.toml; returns the weights' hash."""
+    state = {k: v.detach().half().contiguous() if v.is_floating_point() else v.detach().contiguous()
+             for k, v in network.state_dict().items()}  # fmt: skip
+    data = save(state)
+    digest = hashlib.sha256(data).hexdigest()[:16]
+    values = {k: list(v) if isinstance(v, tuple) else v for k, v in dataclasses.asdict(config).items()}
+    head = {"kind": KIND, "sha256_16": digest, "config": values, "about": dict(about)}
+    write_bytes_atomic(path.with_suffix(".safetensors"), data)
+    write_text_atomic(path.with_suffix(".toml"), tomli_w.dumps(head))
+    return digest
+
+
+def load_detector(path: Path) -> TrainedDetector:
+    """Read weights strictly. path: the file, its stem, or a folder with ``detector.safetensors``. Raises WeightsError
+    where a file is missing, damaged or of something else."""
+    candidates = [path / "detector.safetensors", path.with_suffix(".safetensors")]
+    file = next((c for c in candidates if c.is_file()), None)
+    if file is None:
+        raise WeightsError(
+            f"no detector at {path}: expected a .safetensors file with its .toml beside it, or a folder of posekit "
+            "train detector."
+        )
+    about = file.with_suffix(".toml")
+    try:
+        head = tomllib.loads(about.read_text(encoding="utf-8"))
+        data = file.read_bytes()
+        state = load(data)
+    except FileNotFoundError as error:
+        raise WeightsError(f"{file.name} needs {about.name} beside it: {error}") from error
+    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError, SafetensorError) as error:
+        raise WeightsError(f"the detector {file} is damaged: {error}. Fetch or train it anew.") from error
+    if head.get("kind") != KIND:
+        raise WeightsError(
+            f"{file} holds no Mask R-CNN but something else (pose networks?): pass a detector's weights."
+        )
+    digest = hashlib.sha256(data).hexdigest()[:16]
+    if digest != head.get("sha256_16"):
+        raise WeightsError(f"{file} and {about.name} do not belong together (hash {digest}). Fetch them anew.")
+    config = _config(head.get("config", {}), about)
+    network = build(config)
+    _load_strictly(network, state, file)
+    return TrainedDetector(config, network.eval(), digest, head.get("about", {}))
+
+
+def load_coco() -> TrainedDetector:
+    """The COCO weights of torchvision, by its own loader, which downloads them once. Raises WeightsError."""
+    models = torchvision().models.detection
+    weights = models.MaskRCNN_ResNet50_FPN_Weights.COCO_V1
+    try:
+        network = models.maskrcnn_resnet50_fpn(weights=weights)
+    except OSError as error:
+        raise WeightsError(
+            f"torchvision could not fetch its COCO weights ({error}): this needs the internet once. Without it use "
+            "--detector novel, or weights of posekit train detector."
+        ) from error
+    classes = tuple(weights.meta["categories"][1:])
+    config = dataclasses.replace(paper_config(classes), use_size=(1333, 800))
+    return TrainedDetector(config, network.eval(), str(weights), {"trained_on": "COCO"})
+
+
+def _config(values: Mapping[str, Any], file: Path) -> MaskRCNNConfig:
+    known = {f.name for f in dataclasses.fields(MaskRCNNConfig)}
+    unknown = set(values) - known
+    if unknown:
+        raise WeightsError(f"{file} has unknown keys {sorted(unknown)} in its configuration; known: {sorted(known)}.")
+    chosen: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    return MaskRCNNConfig(**chosen)
+
+
+def _load_strictly(network: nn.Module, state: Mapping[str, Tensor], file: Path) -> None:
+    state = {k: v.float() if v.is_floating_point() else v for k, v in state.items()}
+    if not all(torch.isfinite(v).all() for v in state.values() if v.is_floating_point()):
+        raise WeightsError(f"the detector {file} holds numbers that are not finite.")
+    try:
+        network.load_state_dict(state, strict=True)
+    except RuntimeError as error:
+        raise WeightsError(f"the detector {file} does not fit its configuration: {error}") from error
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What the network says about a picture: boxes (N, 4), edges; labels (N,), numbers of classes from 0; scores (N,);
+    masks bool (N, H, W). By falling score."""
+
+    boxes: NDArray[np.float64]
+    labels: NDArray[np.int64]
+    scores: NDArray[np.float64]
+    masks: NDArray[np.bool_]
+
+
+def find(
+    detector: TrainedDetector,
+    image: NDArray[np.uint8],
+    *,
+    least: float = 0.05,
+    most: int = 50,
+    size: tuple[int, int] | None = None,
+) -> Found:
+    """Run the network on uint8 RGB (H, W, 3). least: score below which nothing is reported. most: detections. size:
+    (width, height) that the picture is fitted into, by default the configuration's ``use_size``."""
+    network = detector.network
+    size = size or detector.config.use_size
+    network.transform.min_size, network.transform.max_size = (min(size),), max(size)
+    network.roi_heads.score_thresh, network.roi_heads.detections_per_img = least, most
+    pixels = torch.from_numpy(image).permute(2, 0, 1).float() / 255
+    with torch.inference_mode():
+        out = network([pixels])[0]
+    masks = (out["masks"][:, 0] > 0.5).numpy()
+    kept = masks.any((1, 2))
+    return Found(
+        out["boxes"].double().numpy()[kept],
+        out["labels"].numpy()[kept] - 1,
+        out["scores"].double().numpy()[kept],
+        masks[kept],
+    )
+
+
+class MaskRCNN:
+    """A Detector that was trained for its classes; a model is found by its name."""
+
+    def __init__(self, detector: TrainedDetector, least: float = 0.5) -> None:
+        self.detector, self.least = detector, least
+
+    def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
+        """Instances of the models; with no models, of all classes. Raises ConfigError where a model is no class."""
+        classes = self.detector.config.classes
+        unknown = [m.name for m in models if m.name not in classes]
+        if unknown:
+            raise ConfigError(
+                f"this detector does not know {', '.join(unknown)}; it was trained for {', '.join(classes)}. Use "
+                "--detector novel, or train one with posekit train detector."
+            )
+        found = find(self.detector, view.image, least=self.least)
+        names = [classes[k] for k in found.labels]
+        wanted = {m.name for m in models} or set(classes)
+        return [
+            Detection(_box(found.boxes[k]), found.masks[k], float(found.scores[k]), name, "mask-rcnn")
+            for k, name in enumerate(names)
+            if name in wanted
+        ]
+
+
+def _box(values: NDArray[np.float64]) -> tuple[float, float, float, float]:
+    x0, y0, x1, y1 = (float(v) for v in values)
+    return x0, y0, x1, y1

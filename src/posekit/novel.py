@@ -1,0 +1,177 @@
+"""Objects that no detector was trained for: class-agnostic proposals, compared with a mesh's templates. Layer 4.
+
+A class-agnostic Mask R-CNN proposes instances of anything. Each is compared with the mesh: by the template
+search that also gives first poses (silhouette and normalised colour), and by the proposal network's own features,
+averaged over the silhouette, and by their median chroma. docs/decisions tells what each is worth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from weakref import WeakKeyDictionary
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+
+from posekit.camera import Camera
+from posekit.detect.backbones import Lite0
+from posekit.detect.maskrcnn import TrainedDetector, find
+from posekit.errors import ConfigError
+from posekit.geometry import Pose, fibonacci_sphere, view_rotation
+from posekit.hypotheses import TemplateSearch
+from posekit.object_model import ObjectModel
+from posekit.render import Light, Renderer
+from posekit.results import Detection
+from posekit.view import View
+from posekit.zoom import zoom_to_box
+
+FArray = NDArray[np.float32]
+
+SIDE = 96  # pixels of the pictures whose features are compared
+LEVEL, STRIDE = "3", 32  # of the backbone's features
+MARGIN = 1.1
+
+
+@dataclass(frozen=True)
+class NovelOptions:
+    """proposals: of a picture at most. least_proposal: their least score. least: the least score of a detection. most:
+    detections of a mesh. features: weight of the features against the templates. chroma: difference of the median a
+    and b (CIELAB, 8 bits) at which a score falls to 1/e. objectness: power of the proposal's own score. views: pictures
+    of a mesh whose features are kept. overlap: intersection over union from which two detections are of one instance.
+    """
+
+    proposals: int = 40
+    least_proposal: float = 0.1
+    least: float = 0.3
+    most: int = 3
+    features: float = 1.0
+    chroma: float = 60.0
+    objectness: float = 0.2
+    views: int = 66
+    overlap: float = 0.5
+
+    def __post_init__(self) -> None:
+        if min(self.proposals, self.most, self.views) < 1 or self.features < 0:
+            raise ConfigError("proposals, most and views are at least 1, features not negative.")
+
+
+class NovelDetector:
+    """A Detector for meshes that it has never seen. What it keeps of a mesh is made at its first use.
+
+    Raises ConfigError where the network is not class-agnostic.
+    """
+
+    def __init__(self, detector: TrainedDetector, renderer: Renderer, options: NovelOptions = NovelOptions()) -> None:
+        if not detector.config.novel:
+            raise ConfigError(
+                f"this detector was trained for {', '.join(detector.config.classes)}, not for any object: pass "
+                "class-agnostic weights, or use it for its own classes."
+            )
+        self.detector, self.renderer, self.options = detector, renderer, options
+        self._known: WeakKeyDictionary[ObjectModel, tuple[TemplateSearch, FArray | None, FArray]] = WeakKeyDictionary()
+
+    def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
+        """The instances of the models, each model's best first; with no models, whatever looks like an object."""
+        proposals = self.propose(view)
+        if not models:
+            return proposals
+        seen = self._features([self._crop(view, p) for p in proposals]) if proposals else None
+        return [found for model in models for found in self._instances(view, model, proposals, seen)]
+
+    def propose(self, view: View) -> list[Detection]:
+        """Objects of any kind, by falling score."""
+        options = self.options
+        found = find(self.detector, view.image, least=options.least_proposal, most=options.proposals)
+        return [
+            Detection((float(b[0]), float(b[1]), float(b[2]), float(b[3])), mask, float(score), None, "novel")
+            for b, mask, score in zip(found.boxes, found.masks, found.scores, strict=True)
+        ]
+
+    def similarities(self, view: View, model: ObjectModel, proposals: Sequence[Detection]) -> list[float]:
+        """How much each proposal looks like the mesh, in [0, 1]."""
+        seen = self._features([self._crop(view, p) for p in proposals]) if proposals else None
+        return self._similarities(view, model, proposals, seen)
+
+    def _similarities(
+        self, view: View, model: ObjectModel, proposals: Sequence[Detection], seen: FArray | None
+    ) -> list[float]:
+        search, features, chroma = self._of(model)
+        weight = self.options.features if features is not None else 0.0
+        scores = []
+        for k, proposal in enumerate(proposals):
+            first = search.search(view, proposal, 1)
+            score = max(0.0, first[0].score) / (1 + search.options.colour) if first else 0.0
+            if features is not None and seen is not None:
+                score += weight * max(0.0, float((features @ seen[k]).max()))
+            apart = float(np.linalg.norm(chroma - _chroma([self._crop(view, proposal)]), axis=1).min())
+            faded = float(np.exp(-apart / self.options.chroma)) * proposal.score**self.options.objectness
+            scores.append(min(1.0, score / (1 + weight)) * faded)
+        return scores
+
+    def _instances(
+        self, view: View, model: ObjectModel, proposals: Sequence[Detection], seen: FArray | None
+    ) -> list[Detection]:
+        scores = self._similarities(view, model, proposals, seen)
+        kept: list[Detection] = []
+        for k in np.argsort(np.negative(scores), kind="stable"):
+            proposal, score = proposals[int(k)], scores[int(k)]
+            if score < self.options.least or len(kept) == self.options.most:
+                break
+            if all(_overlap(proposal, other) < self.options.overlap for other in kept):
+                kept.append(Detection(proposal.box, proposal.mask, score, model.name, "novel"))
+        return kept
+
+    def _of(self, model: ObjectModel) -> tuple[TemplateSearch, FArray | None, FArray]:
+        if model not in self._known:
+            search = TemplateSearch(model, self.renderer)
+            pictures = self._pictures(model)
+            self._known[model] = search, self._features(pictures), _chroma(pictures)
+        return self._known[model]
+
+    def _pictures(self, model: ObjectModel) -> list[View]:
+        distance = 4.0 * model.diameter
+        focal = 0.9 * SIDE * distance / model.diameter
+        camera = Camera(focal, focal, 0.5 * SIDE - 0.5, 0.5 * SIDE - 0.5, SIDE, SIDE)
+        rotations = [view_rotation(d) for d in fibonacci_sphere(self.options.views)]
+        poses = [Pose(R, np.array([0, 0, distance])) @ model.T_obj_ctr.inverse() for R in rotations]
+        drawn = self.renderer.render(model, poses, camera, light=Light(), coords=False)
+        return [view for view in drawn if view.mask is not None and view.mask.any()]
+
+    def _crop(self, view: View, proposal: Detection) -> View:
+        zoom = zoom_to_box(view.camera, proposal.box, (SIDE, SIDE), enlarge=MARGIN)
+        return view.with_mask(proposal.mask).zoomed(zoom)
+
+    def _features(self, pictures: Sequence[View]) -> FArray | None:
+        """The backbone's features over each silhouette, (N, C) of unit length; None for a backbone without them."""
+        body = self.detector.network.backbone.body
+        if not isinstance(body, Lite0) or not pictures:
+            return None
+        normalise = self.detector.network.transform
+        images = torch.from_numpy(np.stack([p.image for p in pictures])).permute(0, 3, 1, 2).float() / 255
+        masks = torch.from_numpy(np.stack([p.mask for p in pictures if p.mask is not None])).float()[:, None]
+        mean, std = (torch.tensor(v)[:, None, None] for v in (normalise.image_mean, normalise.image_std))
+        with torch.inference_mode():
+            out = body((images - mean) / std * masks)[LEVEL]
+            share = F.avg_pool2d(masks, STRIDE)
+            pooled = (out * share).sum((2, 3)) / (share.sum((2, 3)) + 1e-6)
+            return np.asarray(F.normalize(pooled, dim=1).numpy(), np.float32)
+
+
+def _chroma(pictures: Sequence[View]) -> FArray:
+    """The median a and b (CIELAB, 8 bits) over each silhouette, (N, 2)."""
+    rows = []
+    for picture in pictures:
+        mask = picture.mask
+        inside = mask if mask is not None and mask.any() else np.ones(picture.image.shape[:2], np.bool_)
+        rows.append(np.median(cv2.cvtColor(picture.image, cv2.COLOR_RGB2LAB)[inside][:, 1:], axis=0))
+    return np.asarray(rows, np.float32).reshape(-1, 2)
+
+
+def _overlap(a: Detection, b: Detection) -> float:
+    """Intersection over union of two masks."""
+    assert a.mask is not None and b.mask is not None
+    return float((a.mask & b.mask).sum() / max(1, (a.mask | b.mask).sum()))

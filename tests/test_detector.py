@@ -1,0 +1,354 @@
+"""Mask R-CNN and what surrounds it: operators, weights, training, novel objects, detections in files, commands."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from objects import bracket
+from posekit.camera import Camera
+from posekit.cli.app import app
+from posekit.data.tabletop import TabletopConfig, procedural_objects
+from posekit.data.tabletop_stream import TabletopStream, TabletopStreamConfig
+from posekit.detect.coco import Truth, average_precision
+from posekit.detect.external import DetectionsFile, categories_of, to_bop, to_coco
+from posekit.detect.maskrcnn import (
+    SHIPPED,
+    Found,
+    MaskRCNN,
+    MaskRCNNConfig,
+    TrainedDetector,
+    build,
+    find,
+    load_detector,
+    save_detector,
+)
+from posekit.detect.segmentation import decode, encode
+from posekit.detect.vision import nms, roi_align, torchvision
+from posekit.draw import png
+from posekit.errors import ConfigError, PromptError, WeightsError
+from posekit.geometry import Pose, random_rotation
+from posekit.novel import NovelDetector
+from posekit.object_model import ObjectModel
+from posekit.render import Renderer
+from posekit.results import Detection, Estimate
+from posekit.search import SearchOptions, box_overlap, estimate_instances
+from posekit.train.config import MachineConfig, OptimiserConfig, write_config
+from posekit.train.detector import DetectorConfig, DetectorModule, read_config, target, train_detector
+from posekit.view import View
+
+TINY = MaskRCNNConfig(size=(128, 96), use_size=(128, 96), channels=16, hidden=32, proposals=(20, 20), samples=16)
+SCENES = TabletopStreamConfig(
+    batch=2, pool=4, per_block=2, reuse=2, meshes=2, scenes=TabletopConfig(size=(128, 96), distractors=(1, 2))
+)
+
+
+@pytest.fixture(scope="module")
+def renderer() -> Renderer:
+    return Renderer()
+
+
+@pytest.fixture(scope="module")
+def untrained() -> TrainedDetector:
+    torch.manual_seed(0)
+    return TrainedDetector(TINY, build(TINY).eval())
+
+
+# --- torchvision's operators --------------------------------------------------------------------------------------
+
+
+def test_suppression_keeps_the_best_of_what_overlaps() -> None:
+    # the first two overlap by 81 / 119 = 0.68, the third touches nobody, the fourth is half of the second
+    boxes = torch.tensor([[0.0, 0, 10, 10], [1, 1, 11, 11], [20, 20, 30, 30], [1, 1, 11, 6]])
+    scores = torch.tensor([0.5, 0.9, 0.3, 0.7])
+    assert nms(boxes, scores, 0.6).tolist() == [1, 3, 2]
+    assert nms(boxes, scores, 0.45).tolist() == [1, 2]
+    assert nms(boxes, scores, 0.7).tolist() == [1, 3, 0, 2]
+    assert nms(boxes[:0], scores[:0], 0.5).tolist() == []
+
+
+def test_aligned_regions_of_a_plane_are_its_values_at_the_bins_middles() -> None:
+    rows, columns = torch.meshgrid(torch.arange(12.0), torch.arange(16.0), indexing="ij")
+    plane = torch.stack([columns, rows, 2 * columns + rows])[None]
+    region = torch.tensor([[0.0, 4.0, 6.0, 20.0, 14.0]])  # at half scale 2..10 x 3..7
+    for ratio in (0, 1, 2, 3):
+        out = roi_align(plane, region, 0.5, 2, 4, ratio, aligned=True)[0]
+        x, y = torch.tensor([3.0, 5, 7, 9]) - 0.5, torch.tensor([4.0, 6]) - 0.5
+        torch.testing.assert_close(out[0], x.expand(2, 4))
+        torch.testing.assert_close(out[1], y[:, None].expand(2, 4))
+        torch.testing.assert_close(out[2], 2 * out[0] + out[1])
+    without = roi_align(plane, region, 0.5, 2, 4, 2, aligned=False)[0]
+    torch.testing.assert_close(without[0], torch.tensor([3.0, 5, 7, 9]).expand(2, 4))
+
+
+def test_regions_reach_outside_and_belong_to_their_pictures() -> None:
+    pictures = torch.stack([torch.ones(1, 8, 8), 5 * torch.ones(1, 8, 8)])
+    regions = torch.tensor([[1.0, 1, 1, 5, 5], [0, 1, 1, 5, 5], [0, 20, 20, 28, 28]])
+    out = roi_align(pictures, regions, 1.0, 2, 2, 2, True)
+    assert out[:, 0, 0, 0].tolist() == [5.0, 1.0, 0.0]
+
+
+def test_gradients_of_aligned_regions() -> None:
+    features = torch.rand(1, 2, 6, 6, dtype=torch.float64, requires_grad=True)
+    region = torch.tensor([[0.0, 0.7, 1.1, 4.9, 5.3]], dtype=torch.float64)
+    out = roi_align(features, region, 1.0, 2, 2, 2, True)
+    weights = torch.rand_like(out)
+    (gradient,) = torch.autograd.grad((out * weights).sum(), features)
+    torch.testing.assert_close(gradient.sum((0, 2, 3)), weights.sum((0, 2, 3)), rtol=1e-5, atol=1e-5)
+
+
+def test_torchvision_uses_working_operators() -> None:
+    ops = torchvision().ops
+    boxes, scores = torch.tensor([[0.0, 0, 4, 4], [0, 0, 4, 4.1]]), torch.tensor([0.1, 0.2])
+    assert ops.nms(boxes, scores, 0.5).tolist() == [1]
+    pooled = ops.roi_align(torch.full((1, 1, 5, 5), 3.0), [torch.tensor([[0.0, 0, 4, 4]])], 2, 1.0, 2, True)
+    assert pooled.unique().tolist() == [3.0]
+
+
+# --- the network --------------------------------------------------------------------------------------------------
+
+
+def test_weights_come_back_and_are_read_strictly(tmp_path: Path, untrained: TrainedDetector) -> None:
+    digest = save_detector(tmp_path / "detector", TINY, untrained.network, {"steps": 3})
+    for given in (tmp_path, tmp_path / "detector", tmp_path / "detector.safetensors"):
+        again = load_detector(given)
+        assert (again.digest, again.config, again.about["steps"]) == (digest, TINY, 3)
+    image = np.random.default_rng(0).integers(0, 255, (96, 128, 3), dtype=np.uint8)
+    a, b = find(untrained, image, least=0.0), find(again, image, least=0.0)
+    assert len(a.scores) and np.abs(a.scores.max() - b.scores.max()) < 0.02
+    data = (tmp_path / "detector.safetensors").read_bytes()
+    (tmp_path / "detector.safetensors").write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+    with pytest.raises(WeightsError, match="belong together"):
+        load_detector(tmp_path)
+    (tmp_path / "detector.toml").write_text('kind = "other"')
+    with pytest.raises(WeightsError, match="no Mask R-CNN"):
+        load_detector(tmp_path)
+    with pytest.raises(WeightsError, match="no detector at"):
+        load_detector(tmp_path / "nowhere")
+
+
+def test_a_detector_reports_its_classes_only(untrained: TrainedDetector) -> None:
+    view = View(np.zeros((96, 128, 3), np.uint8), Camera.from_fov(1.0, 128, 96))
+    with pytest.raises(ConfigError, match=r"does not know bracket; it was trained for object"):
+        MaskRCNN(untrained).detect(view, [bracket()])
+    found = MaskRCNN(untrained, least=0.0).detect(view, [])
+    assert found and {d.label for d in found} == {"object"}
+    assert all(d.mask is not None and d.mask.shape == (96, 128) for d in found)
+    with pytest.raises(ConfigError, match="backbone is one of"):
+        MaskRCNNConfig(backbone="resnet5")
+
+
+# --- training -----------------------------------------------------------------------------------------------------
+
+
+def test_a_batch_is_a_function_of_its_number_and_its_targets_fit() -> None:
+    def batches(start: int) -> list[dict[str, torch.Tensor]]:
+        stream = iter(TabletopStream(SCENES, 5, [bracket()], agnostic=False, start=start))
+        return [next(stream) for _ in range(2)]
+
+    (_, second), (again, _) = batches(0), batches(1)
+    assert all(torch.equal(second[k], again[k]) for k in second)
+    found = target(second["labels"][0], second["classes"][0])
+    assert len(found["boxes"]) and set(found["labels"].tolist()) == {1}
+    for box, mask in zip(found["boxes"].int().tolist(), found["masks"], strict=True):
+        x0, y0, x1, y1 = box
+        assert mask[y0:y1, x0:x1].sum() == mask.sum() and mask[y0].any() and mask[y1 - 1].any()
+
+
+def test_one_batch_is_learned() -> None:
+    torch.manual_seed(0)
+    module = DetectorModule(build(TINY)).train()
+    batch = next(iter(TabletopStream(SCENES, 1, [bracket()], agnostic=True)))
+    optimiser = torch.optim.AdamW([p for p in module.parameters() if p.requires_grad], 2e-3)
+    losses = []
+    for _ in range(12):
+        loss, parts = module(batch, 0)
+        assert set(parts) == {"classifier", "box_reg", "mask", "objectness", "rpn_box_reg"}
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        losses.append(float(loss.detach()))
+    assert losses[-1] < 0.75 * losses[0], losses
+
+
+def test_training_writes_a_detector_that_a_config_file_describes(tmp_path: Path) -> None:
+    mesh = tmp_path / "box.ply"
+    _write_ply(mesh)
+    config = DetectorConfig(
+        epochs=0, steps=1, validate=1, save=1, log=1, scenes=2, network=TINY, stream=SCENES,
+        optimiser=OptimiserConfig(), machine=MachineConfig(workers=0, threads=1),
+        sources=dataclasses.replace(DetectorConfig().sources, models=(str(mesh),), units="m"),
+    )  # fmt: skip
+    (tmp_path / "c.toml").write_text(write_config(config))
+    assert read_config(tmp_path / "c.toml") == config
+    rows = train_detector(config, tmp_path / "out")
+    assert rows[-1]["step"] == "1" and 0 <= float(rows[-1]["mask_ap50"]) <= 1
+    assert load_detector(tmp_path / "out").config.classes == ("box",)
+    (tmp_path / "bad.toml").write_text("epoks = 3")
+    with pytest.raises(ConfigError, match="did you mean 'epochs'"):
+        read_config(tmp_path / "bad.toml")
+    with pytest.raises(ConfigError, match="trained for meshes"):
+        train_detector(DetectorConfig(), tmp_path / "other")
+
+
+def _write_ply(path: Path) -> None:
+    model = bracket()
+    lines = ["ply", "format ascii 1.0", f"element vertex {len(model.vertices)}"]
+    lines += [f"property float {axis}" for axis in "xyz"]
+    lines += [f"element face {len(model.faces)}", "property list uchar int vertex_indices", "end_header"]
+    lines += [" ".join(f"{v:.6f}" for v in row) for row in model.vertices]
+    lines += ["3 " + " ".join(map(str, row)) for row in model.faces]
+    path.write_text("\n".join(lines) + "\n")
+
+
+# --- average precision and files ----------------------------------------------------------------------------------
+
+
+def _square(x: int, y: int, side: int) -> np.ndarray:
+    mask = np.zeros((60, 80), bool)
+    mask[y : y + side, x : x + side] = True
+    return mask
+
+
+def _found(masks: list[np.ndarray], scores: list[float]) -> Found:
+    boxes = [[c.min(), r.min(), c.max() + 1, r.max() + 1] for r, c in map(np.nonzero, masks)]
+    return Found(np.array(boxes, float), np.zeros(len(masks), int), np.array(scores), np.stack(masks))
+
+
+def test_average_precision_of_what_can_be_counted() -> None:
+    truth = Truth(np.zeros(2, int), [_square(5, 5, 20), _square(40, 20, 20)])
+    exact = average_precision([truth], [_found(list(truth.masks), [0.9, 0.8])])
+    assert exact == pytest.approx({"box_ap": 1.0, "box_ap50": 1.0, "mask_ap": 1.0, "mask_ap50": 1.0})
+    half = average_precision([truth], [_found([truth.masks[0], _square(60, 0, 10)], [0.9, 0.8])])
+    assert half["mask_ap50"] == pytest.approx(51 / 101)  # recall 0 to 0.5 at precision 1, of 101 points
+    nobody = dataclasses.replace(truth, ignored=(False, True))
+    assert average_precision([nobody], [_found([truth.masks[0]], [0.9])])["box_ap50"] == pytest.approx(1.0)
+
+
+def test_masks_and_detections_survive_their_files(tmp_path: Path) -> None:
+    mask = np.random.default_rng(0).random((60, 80)) < 0.3
+    np.testing.assert_array_equal(decode(json.loads(json.dumps(encode(mask))), (80, 60)), mask)
+    counts = {"size": [2, 3], "counts": [1, 2, 3]}  # column by column: 0 1 | 1 0 | 0 0
+    np.testing.assert_array_equal(decode(counts, (3, 2)), [[False, True, False], [True, False, False]])
+    view = View(np.zeros((60, 80, 3), np.uint8), Camera.from_fov(1.0, 80, 60))
+    model = bracket()
+    given = [Detection((5.0, 5.0, 25.0, 25.0), _square(5, 5, 20), 0.25, "bracket"),
+             Detection((40.0, 20.0, 60.0, 40.0), _square(40, 20, 20), 0.75, "bracket")]  # fmt: skip
+    image = Path("000048/rgb/000007.png")
+    texts = {"coco": to_coco(given, ["bracket"], image, (80, 60)), "bop": to_bop(given, ["bracket"], image, 0.5)}
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text)
+        found = DetectionsFile.read(tmp_path / name, image).detect(view, [model])
+        assert [d.score for d in found] == [0.75, 0.25] and found[0].box == given[1].box
+        np.testing.assert_array_equal(found[0].mask, given[1].mask)
+    assert json.loads(texts["bop"])[0]["scene_id"] == 48 and json.loads(texts["bop"])[0]["image_id"] == 7
+    other = DetectionsFile.read(tmp_path / "coco", Path("other.png"))
+    assert len(other.detect(view, [model])) == 2, "a file about one picture is about this one"
+
+
+def test_detections_files_that_are_something_else(tmp_path: Path) -> None:
+    view = View(np.zeros((60, 80, 3), np.uint8), Camera.from_fov(1.0, 80, 60))
+    file = tmp_path / "d.json"
+    for text in ("[1]", "{}", "no JSON", '[{"image_id": 1, "score": 1}]'):
+        file.write_text(text)
+        with pytest.raises(PromptError):
+            DetectionsFile.read(file, Path("1.png")).detect(view, [bracket()])
+    entry = {"image_id": 1, "category_id": 5, "score": 0.5, "bbox": [1, 2, 10, 20]}
+    file.write_text(json.dumps([entry, entry | {"category_id": 6}, entry | {"image_id": 2, "category_id": 6}]))
+    six = ObjectModel.from_arrays(bracket().vertices, bracket().faces, name="obj_000006")
+    found = DetectionsFile.read(file, Path("000001.png")).detect(view, [six])
+    assert [d.box for d in found] == [(1.0, 2.0, 11.0, 22.0)]
+    assert categories_of(["obj_000006", "obj_000009"]) == {"obj_000006": 6, "obj_000009": 9}
+    assert categories_of(["cup", "can"]) == {"cup": 1, "can": 2}
+
+
+# --- novel objects ------------------------------------------------------------------------------------------------
+
+
+def test_proposals_are_compared_with_the_mesh(renderer: Renderer, untrained: TrainedDetector) -> None:
+    rng = np.random.default_rng(4)
+    meshes = [bracket(), *procedural_objects(2, rng, unit=0.12)]
+    camera = Camera.from_fov(0.9, 320, 240)
+    image, proposals = np.full((240, 320, 3), 90, np.uint8), []
+    for k, model in enumerate(meshes):
+        pose = Pose(random_rotation(rng), np.array([0.16 * (k - 1), 0.0, 0.7])) @ model.T_obj_ctr.inverse()
+        [drawn] = renderer.render(model, [pose], camera)
+        assert drawn.mask is not None
+        image[drawn.mask] = drawn.image[drawn.mask]
+        rows, columns = np.nonzero(drawn.mask)
+        box = (float(columns.min()), float(rows.min()), float(columns.max() + 1), float(rows.max() + 1))
+        proposals.append(Detection(box, drawn.mask))
+    detector, view = NovelDetector(untrained, renderer), View(image, camera)
+    for k, model in enumerate(meshes):
+        similar = detector.similarities(view, model, proposals)
+        assert int(np.argmax(similar)) == k and 0.5 < similar[k] <= 1
+    with pytest.raises(ConfigError, match="not for any object"):
+        NovelDetector(TrainedDetector(dataclasses.replace(TINY, classes=("cup",)), untrained.network), renderer)
+
+
+class _Estimator:
+    """Estimates as they are given."""
+
+    def __init__(self, scores: list[float], boxes: list[tuple[float, float, float, float]]) -> None:
+        self.found = [Estimate(Pose.identity(), 0.0, 1, True, s, b, "m") for s, b in zip(scores, boxes, strict=True)]
+
+    def estimate(self, view: View, detections: list[Detection]) -> list[Estimate]:
+        return self.found[: len(detections)]
+
+
+def test_instances_are_what_scores_and_does_not_overlap() -> None:
+    view = View(np.zeros((60, 80, 3), np.uint8), Camera.from_fov(1.0, 80, 60))
+    boxes = [(0.0, 0.0, 10.0, 10.0), (1.0, 0.0, 11.0, 10.0), (30.0, 0.0, 40.0, 10.0), (50.0, 0.0, 60.0, 10.0)]
+    estimator = _Estimator([0.6, 0.8, 0.5, 0.1], boxes)
+    detections = [Detection(box) for box in boxes]
+
+    def scores(options: SearchOptions) -> list[float]:
+        return [e.score for e in estimate_instances(estimator, view, detections, options)]  # type: ignore[arg-type]
+
+    assert scores(SearchOptions(instances=0, least=0.3)) == [0.8, 0.5]
+    assert scores(SearchOptions(instances=1, least=0.3)) == [0.8]
+    assert scores(SearchOptions(least=0.9)) == []
+    assert box_overlap(boxes[0], boxes[1]) == pytest.approx(9 / 11)
+
+
+# --- commands -----------------------------------------------------------------------------------------------------
+
+
+def test_detect_and_estimate_where_nothing_is(tmp_path: Path) -> None:
+    (tmp_path / "grey.png").write_bytes(png(np.full((240, 320, 3), 128, np.uint8)))
+    _write_ply(tmp_path / "box.ply")
+    common = [str(tmp_path / "grey.png"), "--model", str(tmp_path / "box.ply"), "--units", "m"]
+    common += ["--camera", "300,300,160,120"]
+    out = tmp_path / "found"
+    result = CliRunner().invoke(app, ["detect", *common, "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    assert "nothing in the picture could be taken for box" in result.output
+    assert json.loads((out / "bop.json").read_text()) == []
+    assert json.loads((out / "coco.json").read_text())["annotations"] == []
+    result = CliRunner().invoke(app, ["estimate", *common, "--out", str(tmp_path / "poses")])
+    assert result.exit_code == 0, result.output
+    assert "no pose" in result.output
+    assert json.loads((tmp_path / "poses" / "result.json").read_text())["estimates"] == []
+
+
+def test_commands_say_what_is_wrong(tmp_path: Path) -> None:
+    (tmp_path / "grey.png").write_bytes(png(np.full((60, 80, 3), 128, np.uint8)))
+    command = ["detect", str(tmp_path / "grey.png"), "--camera", "80,80,40,30", "--out", str(tmp_path / "o")]
+    result = CliRunner().invoke(app, [*command, "--weights", str(tmp_path / "none")])
+    assert result.exit_code == 1 and "no detector at" in result.output
+    result = CliRunner().invoke(app, [*command, "--weights", "a", "--detector", "b"])
+    assert result.exit_code == 1 and "pass one of them" in " ".join(result.output.split())
+    result = CliRunner().invoke(app, ["train", "detector", "--out", str(tmp_path / "t")])
+    assert result.exit_code == 1 and "--models" in result.output
+
+
+def test_the_shipped_detector_is_class_agnostic_and_small() -> None:
+    detector = load_detector(SHIPPED)
+    assert detector.config.novel and detector.config.backbone == "lite0"
+    assert SHIPPED.with_suffix(".safetensors").stat().st_size < 10e6
