@@ -1,0 +1,311 @@
+"""Synthetic data sets: true to their own annotations, the same whoever makes them, and whole after a kill."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import itertools
+import json
+import os
+import signal
+import subprocess
+import sys
+import tarfile
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from objects import bracket, cuboid
+from posekit.cli.app import app
+from posekit.data.bop import BopDataset
+from posekit.data.bop_writer import write_models
+from posekit.data.symmetry import detect_symmetries
+from posekit.data.synth.backdrops import Backdrops
+from posekit.data.synth.plan import SynthConfig
+from posekit.data.synth.run import Machines, begin, run
+from posekit.errors import ConfigError, InputError, OutputError
+from posekit.metrics import pose_error
+from posekit.object_model import ObjectModel
+from posekit.render import Renderer
+
+SIZE = (160, 120)
+QUIET = lambda done, total: None  # noqa: E731
+
+
+def objects() -> dict[int, ObjectModel]:
+    """A bracket, and a textured box."""
+    vertices, faces = cuboid((-0.05, -0.02, -0.03), (0.05, 0.02, 0.03), cells=4)
+    rng = np.random.default_rng(0)
+    uvs = rng.random((len(vertices), 2))
+    texture = rng.integers(0, 256, (16, 16, 3)).astype(np.uint8)
+    return {2: bracket((0.02, 0, 0)), 5: ObjectModel.from_arrays(vertices, faces, name="box", uvs=uvs, texture=texture)}
+
+
+def config(kind: str, images: int, **changes: object) -> SynthConfig:
+    return dataclasses.replace(SynthConfig(kind, images, seed=3, size=SIZE, frames=3), **changes)
+
+
+def make(root: Path, what: SynthConfig, machines: Machines = Machines(), shard: int = 0) -> BopDataset:
+    begin(what, root, objects())
+    run(root, machines, QUIET, shard)
+    return BopDataset(root, what.split, targets=None)
+
+
+def digest(root: Path) -> dict[str, str]:
+    """Every file and what is in it."""
+    files = sorted(p for p in root.rglob("*") if p.is_file())
+    return {str(p.relative_to(root)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+
+
+@pytest.fixture(scope="module")
+def renderer() -> Renderer:
+    return Renderer()
+
+
+@pytest.mark.parametrize("kind", ["randomised", "scenes", "sequence"])
+def test_its_own_truth_is_right(kind: str, tmp_path: Path, renderer: Renderer) -> None:
+    """Read back, each pose has no error, and the mesh drawn there covers the mask; depth is the mesh's."""
+    data = make(tmp_path / "set", config(kind, 6))
+    assert len(data.images()) == 6
+    checked = 0
+    for scene, image in data.images():
+        view = data.view(scene, image)
+        units = cv2.imread(str(data.image_path(scene, image).parent.parent / f"depth/{image:06d}.png"), -1)
+        for instance in data.instances(scene, image, every=True):
+            model = data.model(instance.obj_id)
+            turn, shift = pose_error(instance.T_cam_obj, instance.T_cam_obj, model.symmetries.transforms())
+            assert turn < 1e-6 and shift < 1e-9
+            [drawn] = renderer.render(model, [instance.T_cam_obj], view.camera)
+            visible = instance.mask()
+            assert drawn.mask is not None and drawn.depth is not None
+            assert not (visible & ~drawn.mask).sum() > 0.01 * visible.sum() + 2
+            if instance.visib_fract == 1.0 and visible.sum() > 300:
+                assert (drawn.mask & visible).sum() / (drawn.mask | visible).sum() > 0.99
+                checked += 1
+            inside = visible & drawn.mask
+            np.testing.assert_allclose(units[inside] * 1e-4, drawn.depth[inside], atol=2e-4)
+    assert checked > 0
+
+
+def test_several_workers_make_the_same_images(tmp_path: Path) -> None:
+    what = config("randomised", 20)
+    make(tmp_path / "one", what)
+    make(tmp_path / "two", what, Machines(workers=2))
+    assert digest(tmp_path / "one") == digest(tmp_path / "two")
+    make(tmp_path / "other", dataclasses.replace(what, seed=4))
+    assert digest(tmp_path / "other") != digest(tmp_path / "one")
+
+
+def test_a_ray_cluster_makes_the_same_images(tmp_path: Path) -> None:
+    what = config("sequence", 6)
+    make(tmp_path / "one", what)
+    make(tmp_path / "ray", what, Machines(workers=2, ray="local"))
+    assert digest(tmp_path / "one") == digest(tmp_path / "ray")
+
+
+def test_killed_and_resumed_is_never_killed(tmp_path: Path) -> None:
+    what = config("randomised", 40)
+    make(tmp_path / "whole", what)
+    root = tmp_path / "killed"
+    begin(what, root, objects())
+    code = "import sys; from pathlib import Path; from posekit.data.synth.run import Machines, run\n" \
+           "run(Path(sys.argv[1]), Machines(), lambda done, total: None)"  # fmt: skip
+    for wanted in (3, 17):
+        process = subprocess.Popen([sys.executable, "-c", code, str(root)], start_new_session=True)
+        records = root / ".records" / "train"
+        while process.poll() is None and (not records.is_dir() or len(list(records.iterdir())) < wanted):
+            time.sleep(0.005)
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    done = len(list((root / ".records" / "train").glob("*.json")))
+    assert 0 < done < 40
+    assert run(root, Machines(), QUIET) == 40 - done
+    assert digest(root) == digest(tmp_path / "whole")
+    assert run(root, Machines(), QUIET) == 0
+    assert digest(root) == digest(tmp_path / "whole")
+
+
+def test_shards_hold_every_image_once(tmp_path: Path) -> None:
+    data = make(tmp_path / "set", config("randomised", 5), shard=2)
+    names = []
+    for path in sorted((tmp_path / "set" / "shards").glob("*.tar")):
+        with tarfile.open(path) as tar:
+            names += tar.getnames()
+    kinds = {"rgb.jpg", "depth.png", "camera.json", "gt.json", "gt_info.json", "mask_visib.json"}
+    assert sorted(names) == sorted(f"{s:06d}_{i:06d}.{kind}" for s, i in data.images() for kind in kinds)
+    assert len(list((tmp_path / "set" / "shards").glob("*.tar"))) == 3
+
+
+def test_report(tmp_path: Path) -> None:
+    make(tmp_path / "set", config("randomised", 6))
+    numbers = json.loads((tmp_path / "set" / "statistics.json").read_text())
+    assert numbers["images"] == 6 and numbers["instances_by_object"] == {"2": 3, "5": 3}
+    assert cv2.imread(str(tmp_path / "set" / "contact_sheet.jpg")).shape[1] > 600
+
+
+def test_masks_are_dilated_beside(tmp_path: Path) -> None:
+    make(tmp_path / "set", config("randomised", 4))
+    for path in (tmp_path / "set").rglob("mask_dilated/*.png"):
+        grown, mask = cv2.imread(str(path), 0), cv2.imread(str(path).replace("mask_dilated", "mask_visib"), 0)
+        assert (grown >= mask).all()
+
+
+def test_a_sequence_moves_smoothly(tmp_path: Path) -> None:
+    data = make(tmp_path / "set", config("sequence", 8, frames=4))
+    assert data.scenes() == [1, 2]
+    for scene in data.scenes():
+        first = [data.instances(scene, image, every=True)[0].T_cam_obj for image in range(4)]
+        for a, b in itertools.pairwise(first):
+            turn, shift = pose_error(a, b)
+            assert 0 < turn < 0.3 and shift < 0.05
+
+
+def test_backgrounds(tmp_path: Path) -> None:
+    voc = tmp_path / "VOC2012" / "JPEGImages"
+    voc.mkdir(parents=True)
+    cv2.imwrite(str(voc / "a.png"), np.full((60, 80, 3), (255, 0, 0), np.uint8))
+    cv2.imwrite(str(tmp_path / "VOC2012" / "labels.png"), np.zeros((60, 80, 3), np.uint8))
+    picture = Backdrops(str(tmp_path / "VOC2012"), 0).draw(np.random.default_rng(0), (32, 24))
+    assert picture.shape == (24, 32, 3) and tuple(picture[0, 0]) == (0, 0, 255)
+    with pytest.raises(InputError, match="there is no folder of backgrounds"):
+        Backdrops(str(tmp_path / "none"), 0)
+    with pytest.raises(InputError, match="holds no JPEG"):
+        Backdrops(str(tmp_path), 0)
+
+
+def test_symmetries_are_found(renderer: Renderer) -> None:
+    import trimesh
+
+    def plain(mesh: trimesh.Trimesh) -> ObjectModel:
+        return ObjectModel.from_arrays(mesh.vertices + [0.1, 0, 0], mesh.faces)
+
+    cylinder = detect_symmetries(renderer, plain(trimesh.creation.cylinder(0.03, 0.1, sections=256)))
+    assert len(cylinder.continuous) == 1 and abs(cylinder.continuous[0].axis[2]) == 1 and cylinder.discrete
+    box = detect_symmetries(renderer, plain(trimesh.creation.box((0.1, 0.06, 0.04))))
+    assert len(box.discrete) == 3 and not box.continuous
+    square = detect_symmetries(renderer, plain(trimesh.creation.box((0.06, 0.06, 0.1))))
+    assert len(square.discrete) == 7
+    found = detect_symmetries(renderer, bracket())
+    assert not found.discrete and not found.continuous
+    vertices, faces = cuboid((-0.03, -0.02, -0.05), (0.03, 0.02, 0.05), cells=8)
+    colours = np.where(vertices[:, :1] > 0, [[220, 30, 30]], [[30, 30, 220]])
+    painted = detect_symmetries(renderer, ObjectModel.from_arrays(vertices, faces, colors=colours))
+    assert len(painted.discrete) == 1, "paint takes the turns away that shape alone would have"
+
+
+# --- command line -----------------------------------------------------------------------------------------------
+
+
+def synth(*args: object) -> tuple[int, str]:
+    result = CliRunner().invoke(app, ["synth", *map(str, args)])
+    return result.exit_code, result.output
+
+
+@pytest.fixture
+def meshes(tmp_path: Path) -> Path:
+    write_models(tmp_path, objects())
+    return tmp_path / "models"
+
+
+def test_command_and_resume(tmp_path: Path, meshes: Path) -> None:
+    out = tmp_path / "set"
+    code, text = synth("--models", meshes, "--out", out, "--images", 4, "--size", "160x120", "--quality", 0)
+    assert code == 0, text
+    assert "4 images made" in text
+    data = BopDataset(out, "train")
+    assert data.model_ids() == [2, 5] and data.image_path(2, 0).suffix == ".png"
+    code, text = synth("--models", meshes, "--out", out, "--images", 4)
+    assert code == 1 and "pass --resume to go on with its data set" in text
+    code, text = synth("--out", out, "--resume", "--shards", 3)
+    assert code == 0 and "0 images made" in text and len(list((out / "shards").iterdir())) == 2
+
+
+def test_command_errors(tmp_path: Path, meshes: Path) -> None:
+    for args, words in (
+        (("--out", tmp_path / "a"), "a data set needs meshes"),
+        (("--out", tmp_path / "a", "--resume"), "no data set was begun there"),
+        (("--out", tmp_path / "a", "--resume", "--models", meshes), "leave --models out"),
+        (("--out", tmp_path / "a", "--models", tmp_path / "x.ply"), "there is no mesh"),
+        (("--out", tmp_path / "a", "--models", meshes, "--size", "9"), "give WIDTHxHEIGHT"),
+        (("--out", tmp_path / "a", "--models", meshes, "--workers", 0), "at least 1 is needed"),
+        (("--out", tmp_path / "a", "--models", meshes, "--quality", 101), "JPEG quality"),
+    ):
+        code, text = synth(*args)
+        assert code == 1 and words in " ".join(text.split()), text
+        assert not (tmp_path / "a" / "synth.json").exists()
+
+
+def test_settings_that_make_no_sense(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="the kind is one of"):
+        SynthConfig("other", 1)
+    with pytest.raises(ConfigError, match="needs objects"):
+        begin(config("randomised", 1), tmp_path / "set", {})
+    (tmp_path / "synth.json").write_text("{}")
+    with pytest.raises(InputError, match="is no configuration of a synthetic data set"):
+        SynthConfig.read(tmp_path)
+    with pytest.raises(OutputError, match="holds files"):
+        begin(config("randomised", 1), tmp_path, objects())
+
+
+# --- photoreal --------------------------------------------------------------------------------------------------
+
+
+def test_rooms_are_traced_where_masks_are(tmp_path: Path, renderer: Renderer) -> None:
+    """Mitsuba and posekit's renderer see the same surfaces at the same depth; the same seed gives the same pixels."""
+    from posekit.data.synth.photoreal import Photoreal
+
+    what = config("photoreal", 2, size=(64, 48), samples=2, views=2, variant="scalar_rgb")
+    data = make(tmp_path / "set", what)
+    maker = Photoreal(what, {k: data.model(k) for k in data.model_ids()}, renderer)
+    room = maker._room(np.random.default_rng([what.seed, 0, 0]))
+    scene = maker.mi.load_dict(room.scene)
+    seen = 0
+    for image in range(2):
+        camera = data.view(1, image).camera
+        instances = data.instances(1, image, every=True)
+        T_world_obj = {obj_id: pose for obj_id, _, pose in room.objects}
+        T_cam_world = instances[0].T_cam_obj @ T_world_obj[instances[0].obj_id].inverse()
+        traced = maker._depth(scene, camera, T_cam_world)
+        for instance in instances:
+            model = data.model(instance.obj_id)
+            [drawn] = renderer.render(model, [instance.T_cam_obj], camera)
+            inner = cv2.erode(instance.mask().astype(np.uint8), np.ones((3, 3))) > 0
+            assert drawn.depth is not None
+            np.testing.assert_allclose(traced[inner], drawn.depth[inner], atol=2e-4)
+            seen += int(inner.sum())
+            assert model.bounds[0] is not None and T_world_obj[instance.obj_id].apply(model.outline)[:, 2].min() > -1e-6
+    assert seen > 100
+    again = make(tmp_path / "again", what)
+    assert digest(again.root) == digest(data.root)
+    assert np.ptp(data.view(1, 0).image) > 60
+
+
+def test_what_photoreal_needs_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    from posekit.data.synth import photoreal
+
+    with pytest.raises(ConfigError, match=r"--variant nothing: this Mitsuba has .*scalar_rgb"):
+        photoreal.load_mitsuba("nothing")
+    monkeypatch.setattr(photoreal, "find_llvm", lambda: None)
+    with pytest.raises(ConfigError, match="apt-get install libllvm19"):
+        photoreal.load_mitsuba("llvm_ad_rgb")
+    monkeypatch.setitem(sys.modules, "mitsuba", None)
+    with pytest.raises(ConfigError, match=r"pip install 'posekit\[photoreal\]'"):
+        photoreal.load_mitsuba("auto")
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    with pytest.raises(ConfigError, match=r"pip install 'posekit\[photoreal\]'"):
+        photoreal.drop([], np.random.default_rng(0), 0.1)
+
+
+def test_things_dropped_come_to_rest() -> None:
+    from posekit.data.synth.photoreal import drop
+
+    models = [bracket(), *objects().values()]
+    poses = drop(models, np.random.default_rng(1), 0.1)
+    lowest = [pose.apply(model.outline)[:, 2].min() for pose, model in zip(poses, models, strict=True)]
+    assert min(lowest) > -1e-6 and min(lowest) < 0.005
+    again = drop(models, np.random.default_rng(1), 0.1)
+    assert all(np.array_equal(a.matrix, b.matrix) for a, b in zip(poses, again, strict=True))
