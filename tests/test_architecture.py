@@ -17,7 +17,7 @@ LAYERS = {
     0: {"geometry", "camera", "files"},
     1: {"view", "object_model", "results"},
     2: {"load", "zoom", "metrics", "pnp", "render", "nets", "detect", "draw"},
-    3: {"data", "refine", "hypotheses", "figures"},
+    3: {"data", "refine", "hypotheses", "figures", "video"},
     4: {"estimate", "novel"},
     5: {"search", "track", "evaluate", "train"},
     6: {"cli"},
@@ -37,6 +37,7 @@ DOORS = {
     "rich": {"cli"},
     "huggingface_hub": {"data"},
     "pycocotools": {"detect"},
+    "av": {"video"},
 }
 
 ROOM_LAYER = {room: layer for layer, rooms in LAYERS.items() for room in rooms}
