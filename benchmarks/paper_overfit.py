@@ -1,6 +1,6 @@
 """Can the paper's recipe learn a data set by heart? MV-Net and SV-Net at reduced size on a tiny set in BOP layout.
 
-    python benchmarks/paper_overfit.py [--minutes 40] [--photos 2] [--size 64x48] [--width 0.375]
+    python benchmarks/paper_overfit.py [--minutes 40] [--photos 2] [--size 128x96] [--width 0.25]
 
 Renders a few photographs of one object, trains `--recipe paper` on them (AdamW with a rate that falls along a cosine,
 which gets there sooner than SGD at a constant one), and refines each photograph's pose from DeepIM's disturbances with
@@ -89,9 +89,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--photos", type=int, default=2)
     parser.add_argument("--minutes", type=float, default=40)
-    parser.add_argument("--size", default="64x48", help="of the crops")
-    parser.add_argument("--width", type=float, default=0.375)
-    parser.add_argument("--rate", type=float, default=1e-3)
+    parser.add_argument("--size", default="128x96", help="of the crops")
+    parser.add_argument("--width", type=float, default=0.25)
+    parser.add_argument("--rate", type=float, default=5e-4)
     parser.add_argument("--every", type=int, default=500)
     args = parser.parse_args()
     size = [int(part) for part in args.size.split("x")]

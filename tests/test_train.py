@@ -25,16 +25,20 @@ from typer.testing import CliRunner
 from objects import bracket
 from posekit.camera import Camera
 from posekit.cli.app import app
+from posekit.data.augment import AugmentConfig
 from posekit.data.bop import BopDataset
+from posekit.data.scenes import SceneConfig
 from posekit.data.stream import PairStream, StreamConfig
 from posekit.errors import ConfigError, OutputError, TrainingError, WeightsError
 from posekit.geometry import Pose, random_rotation
 from posekit.nets.flownet import LAYERS
+from posekit.nets.heads import compress_angle
 from posekit.nets.lite import LiteConfig, LiteSVNet
 from posekit.nets.paper import PaperSVNet
-from posekit.nets.weights import load_networks
+from posekit.nets.weights import build, load_networks, save_networks
 from posekit.object_model import ObjectModel
 from posekit.render import Renderer
+from posekit.train.calibrate import fit_median, passed_poses
 from posekit.train.checkpoint import Checkpoint, Checkpoints
 from posekit.train.config import (
     MachineConfig,
@@ -46,6 +50,7 @@ from posekit.train.config import (
     write_config,
 )
 from posekit.train.loop import Trainer, make_fabric, rate_at
+from posekit.train.measure import CaseSource, rendered_cases
 from posekit.train.paper import PaperTask
 from posekit.train.pose import make_task, resume_pose, train_pose
 from posekit.train.sources import Sources
@@ -53,7 +58,7 @@ from posekit.train.sources import Sources
 SMALL = LiteConfig(widths=(16, 32), blocks=1, fine=16)
 STREAM = StreamConfig(batch=2, shard=2, pool=16, per_object=4, mvnet=1)
 CONFIG = TrainConfig(
-    steps=4, validate=100, save=2, log=1, cases=1, stream=STREAM, lite=SMALL,
+    steps=4, validate=100, save=2, log=1, cases=1, calibrate=0, stream=STREAM, lite=SMALL,
     optimiser=OptimiserConfig(warmup=2), machine=MachineConfig("cpu", workers=0, threads=1, precision="32-true"),
 )  # fmt: skip
 NO_SOURCES = Sources([], [], [], None)
@@ -228,11 +233,61 @@ def test_a_full_disk_leaves_the_last_good_checkpoint(tmp_path: Path) -> None:
     assert checkpoints.last() == 1 and checkpoints.load(1).step == 1
 
 
+# --- the predicted angle ---
+
+
+def test_a_median_is_fitted_whatever_the_outliers() -> None:
+    draw = torch.Generator().manual_seed(1)
+    x = torch.randn(2000, 5, generator=draw) * torch.tensor([1.0, 10, 0.1, 1, 1]) + 3
+    truth, bias = torch.tensor([0.5, -0.02, 2.0, 0.0, 0.3]), 1.5
+    y = x @ truth + bias
+    y[::10] += 50
+    weight, found = fit_median(x, y)
+    assert float((x @ weight + found - x @ truth - bias).abs().median()) < 0.15
+
+
+def test_calibration_makes_a_sure_head_honest(tmp_path: Path) -> None:
+    """A network that never turns a pose and says "no error" learns to say how large the errors are."""
+    torch.manual_seed(0)
+    networks = build("lite", SMALL)
+    head = networks.svnet.heads.angle
+    assert head is not None
+    with torch.no_grad():
+        head.weight.zero_()
+        head.bias.zero_()
+    (tmp_path / "start").mkdir()
+    save_networks(tmp_path / "start" / "lite", networks, {"trained_on": "nothing"})
+    arguments = ["train", "angle", "--weights", str(tmp_path / "start"), "--out", str(tmp_path / "done"),
+                 "--cases", "12"]  # fmt: skip
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    fitted = load_networks("lite", tmp_path / "done")
+    assert fitted.about["calibrated_on"] == 12 and fitted.about["trained_on"] == "nothing"
+    cases = rendered_cases(CaseSource([], [], SceneConfig(), AugmentConfig()), Renderer(), 8, seed=5)
+    passed = passed_poses(fitted, cases, Renderer(), iterations=2)
+    assert passed.angle.shape == (16,) and passed.last.sum() == 8
+    found = fitted.svnet.heads.angle
+    assert found is not None
+    with torch.no_grad():
+        said = found(torch.from_numpy(passed.features))[:, 0]
+        before = head(torch.from_numpy(passed.features))[:, 0]
+    truth = compress_angle(torch.from_numpy(passed.angle))
+    assert (said - truth).abs().mean() < 0.6 * (before - truth).abs().mean()
+    moved = {
+        k
+        for k, v in fitted.svnet.state_dict().items()
+        if not torch.equal(v, networks.svnet.state_dict()[k].half().float())
+    }
+    assert {k for k in moved if "num_batches" not in k} == {"heads.angle.weight", "heads.angle.bias"}
+    again = CliRunner().invoke(app, arguments)
+    assert again.exit_code == 1 and "holds files" in again.output
+
+
 # --- the paper's recipe ---
 
 PAPER = changed(
     default_config("paper"),
-    {"epochs": 0, "steps": 60, "validate": 1000, "save": 1000, "cases": 0, "overfit": True,
+    {"epochs": 0, "steps": 60, "validate": 1000, "save": 1000, "cases": 0, "calibrate": 0, "overfit": True,
      "paper": {"size": [64, 48], "width": 0.25}, "optimiser": {"kind": "adamw", "rate": 0.0005},
      "stream": {"batch": 2, "shard": 2, "pool": 4, "per_object": 2},
      "machine": {"accelerator": "cpu", "workers": 0, "threads": 1}},

@@ -118,6 +118,37 @@ def pose(
         typer.echo(f"weights: {out}; use them with: posekit estimate --weights {out}")
 
 
+@train.command("angle")
+def angle(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the weights.")],
+    weights: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Weights to start from, in place of the shipped ones.")
+    ] = None,
+    preset: Annotated[Literal["lite", "paper"], typer.Option(help="The networks.")] = "lite",
+    model: Annotated[
+        list[Path] | None, typer.Option("--model", "-m", metavar="MESH", help="An object; repeat it.")
+    ] = None,
+    meshes: Annotated[list[Path] | None, typer.Option(metavar="DIR", help="A folder of meshes.")] = None,
+    share: Annotated[float, typer.Option(min=0, max=1, help="Of the meshes; the rest is procedural.")] = 1.0,
+    units: Annotated[Units, typer.Option(help="Of the meshes.")] = "auto",
+    backgrounds: Annotated[Path | None, typer.Option(metavar="DIR", help="Photographs for backgrounds.")] = None,
+    cases: Annotated[int, typer.Option(min=1, help="Renderings to refine.")] = 240,
+) -> None:
+    """Fit the predicted angle alone to what refinement leaves; `train pose` does so at its end."""
+    from posekit.train.config import changed, default_config
+    from posekit.train.pose import calibrate_angle
+
+    asked = {
+        "calibrate": cases, "stream": {"share": share},
+        "sources": {"models": _texts(model), "meshes": _texts(meshes), "units": units,
+                    "backgrounds": _text(backgrounds)},
+    }  # fmt: skip
+    chosen = changed(default_config(preset), _given(asked), "the command line")
+    with _bar() as show:
+        calibrate_angle(chosen, weights, out, show)
+    typer.echo(f"weights: {out}; use them with: posekit estimate --weights {out}")
+
+
 def _config(file: Path | None, asked: dict[str, Any], objects: bool) -> TrainConfig:
     """Defaults of the recipe, then the file, then what options ask for. Training for given objects starts from the
     shipped weights, at a lower rate."""
@@ -184,7 +215,8 @@ def _bar() -> Iterator[Show]:
 
         def show(progress: Any) -> None:
             loss = progress.values.get("loss", float("nan"))
-            bar.update(task, completed=progress.done, description=f"step {progress.step}, loss {loss:.3f}")
+            told = progress.label or f"step {progress.step}, loss {loss:.3f}"
+            bar.update(task, completed=progress.done, description=told)
 
         yield show
 

@@ -11,6 +11,15 @@ from posekit.nets.flownet import FlowNetEncoder
 from posekit.nets.heads import PoseHeads, Prediction, expand_angle
 
 
+def _linear(features: int, out: int) -> nn.Linear:
+    """A layer before LeakyReLU 0.1 that keeps the differences between samples, as the encoder's do: with torch's own
+    start they shrank tenfold, and without FlowNetS's weights the networks did not begin to learn (docs/log.md)."""
+    layer = nn.Linear(features, out)
+    nn.init.kaiming_normal_(layer.weight, a=0.1)
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
 class Branch(nn.Module):
     """FlowNetS's encoder and one fully connected layer of 256; one set of weights for every branch."""
 
@@ -18,7 +27,7 @@ class Branch(nn.Module):
         super().__init__()
         self.encoder = FlowNetEncoder(width)
         cells = math.ceil(size[0] / 64) * math.ceil(size[1] / 64)
-        self.fc = nn.Linear(self.encoder.out_channels * cells, 256)
+        self.fc = _linear(self.encoder.out_channels * cells, 256)
 
     def forward(self, observed: Tensor, rendered: Tensor) -> Tensor:
         """Two (B, 4, H, W), RGB and mask -> (B, 256)."""
@@ -32,7 +41,7 @@ class PaperSVNet(nn.Module):
     def __init__(self, branch: Branch) -> None:
         super().__init__()
         self.branch = branch
-        self.fc = nn.Linear(256, 256)
+        self.fc = _linear(256, 256)
         self.heads = PoseHeads(256, with_angle=True)
 
     def forward(self, observed: Tensor, rendered: Tensor) -> Prediction:
@@ -49,7 +58,7 @@ class PaperMVNet(nn.Module):
         super().__init__()
         self.branch = branch
         self.views = views
-        self.fc = nn.Linear(256 * views, 512)
+        self.fc = _linear(256 * views, 512)
         self.heads = PoseHeads(512, with_angle=False)
 
     def forward(self, observed: Tensor, views: Tensor) -> Prediction:

@@ -93,7 +93,7 @@ class TrainConfig:
     """steps: optimiser steps of the schedule. minutes: of wall clock, where above 0; whichever ends first. epochs:
     where above 0, the steps follow from the sources (paper recipe). validate, save, log: every so many steps. keep:
     checkpoints kept beside the best. overfit: train on the first batch again and again. cases: held-back renderings
-    that the loop is measured on."""
+    that the loop is measured on. calibrate: renderings that the angle head is fitted on at the end; 0 = not at all."""
 
     recipe: str = "lite"
     steps: int = 7000
@@ -105,6 +105,7 @@ class TrainConfig:
     log: int = 50
     keep: int = 3
     cases: int = 48
+    calibrate: int = 240
     overfit: bool = False
     profile: bool = False
     optimiser: OptimiserConfig = OptimiserConfig()
@@ -119,8 +120,8 @@ class TrainConfig:
         _one_of("recipe", self.recipe, RECIPES)
         if min(self.steps, self.validate, self.save, self.log, self.keep) < 1:
             raise ConfigError("steps, validate, save, log and keep are at least 1.")
-        if self.minutes < 0 or self.cases < 0 or self.epochs < 0:
-            raise ConfigError("minutes, epochs and cases are not negative.")
+        if min(self.minutes, self.cases, self.epochs, self.calibrate) < 0:
+            raise ConfigError("minutes, epochs, cases and calibrate are not negative.")
 
     @property
     def world(self) -> int:

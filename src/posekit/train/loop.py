@@ -102,12 +102,14 @@ class Task(Protocol):
 
 @dataclass(frozen=True)
 class Progress:
-    """What a progress bar may show. done: in [0, 1]. values: running means of the loss and its parts."""
+    """What a progress bar may show. done: in [0, 1]. values: running means of the loss and its parts. label: what is
+    being done, where it is not the training's steps."""
 
     step: int
     done: float
     seconds: float
     values: Mapping[str, float]
+    label: str = ""
 
 
 Show = Callable[[Progress], None]

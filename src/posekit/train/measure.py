@@ -38,16 +38,20 @@ class Case:
     detection: Detection
 
 
-def held_back_cases(
-    renderer: Renderer,
-    models: Sequence[ObjectModel],
-    photos: Sequence[NDArray[np.uint8]],
-    config: SceneConfig,
-    augment: AugmentConfig,
-    count: int,
-) -> list[Case]:
-    """``count`` augmented renderings of the meshes in turn; of new procedural objects where there are none."""
-    rng = np.random.default_rng(HELD_BACK)
+@dataclass(frozen=True, eq=False)
+class CaseSource:
+    """What renderings for cases are made of. models: in turn; none = new procedural objects."""
+
+    models: Sequence[ObjectModel]
+    photos: Sequence[NDArray[np.uint8]]
+    scenes: SceneConfig
+    augment: AugmentConfig
+
+
+def rendered_cases(source: CaseSource, renderer: Renderer, count: int, seed: int = HELD_BACK) -> list[Case]:
+    """``count`` augmented renderings."""
+    models, photos, config, augment = source.models, source.photos, source.scenes, source.augment
+    rng = np.random.default_rng(seed)
     cases: list[Case] = []
     others: list[NDArray[np.uint8]] = []
     while len(cases) < count:

@@ -19,10 +19,13 @@ from posekit.data.scene_stream import Catalogue
 from posekit.errors import ConfigError, OutputError, WeightsError
 from posekit.files import write_text_atomic
 from posekit.nets.lite import LiteConfig, LiteMVNet, LiteSVNet
-from posekit.nets.weights import Networks, build, load_networks
+from posekit.nets.weights import Networks, build, load_networks, save_networks
+from posekit.render import Renderer
+from posekit.train.calibrate import SEED, calibrate
 from posekit.train.config import TrainConfig, read_config, write_config
 from posekit.train.lite import LiteTask
-from posekit.train.loop import Show, Task, Trainer, keep_memory, make_fabric
+from posekit.train.loop import Progress, Show, Task, Trainer, keep_memory, make_fabric
+from posekit.train.measure import CaseSource, rendered_cases
 from posekit.train.paper import PaperTask
 from posekit.train.sources import Sources, read_sources
 
@@ -55,12 +58,48 @@ def _train(config: TrainConfig, out: Path, show: Show | None) -> list[dict[str, 
     torch.manual_seed(config.seed)  # the same new networks in every process
     task = make_task(config, sources)
     if fabric.global_rank == 0:
-        try:
-            out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(f"the folder {out} cannot be made: {error.strerror}.") from error
+        _make(out)
         write_text_atomic(out / CONFIG, write_config(config))
-    return Trainer(_scheduled(config, task, fabric.world_size), task, fabric, out, show).run()
+    rows = Trainer(_scheduled(config, task, fabric.world_size), task, fabric, out, show).run()
+    if rows and config.calibrate:
+        _calibrate(config, sources, config.recipe, out, out, show)
+    return rows
+
+
+def calibrate_angle(config: TrainConfig, weights: Path | None, out: Path, show: Show | None = None) -> None:
+    """Fit the angle head of weights (None = the shipped ones) for ``config.sources``, and write them into ``out``.
+
+    Raises OutputError where ``out`` holds files, WeightsError, MeshError, TrainingError.
+    """
+    claim(out, force=False)
+    _make(out)
+    _calibrate(config, read_sources(config.sources), config.recipe, weights, out, show)
+
+
+def _calibrate(
+    config: TrainConfig, sources: Sources, preset: str, weights: Path | None, out: Path, show: Show | None
+) -> None:
+    """With renderings as the stream has them: of given meshes, of procedural ones, or both by the stream's share."""
+    networks, renderer, stream = load_networks(preset, weights), Renderer(), config.stream
+    models = sources.models or [m for data, _ in sources.bop for m in map(data.model, data.model_ids())]
+    source = CaseSource(models, sources.photos, stream.scenes, stream.augment)
+    given = round(config.calibrate * (stream.share if models else 0.0))
+    cases = rendered_cases(source, renderer, given, SEED) if given else []
+    cases += rendered_cases(dataclasses.replace(source, models=[]), renderer, config.calibrate - given, SEED)
+
+    def tell(done: int, count: int) -> None:
+        if show is not None:
+            show(Progress(done, done / count, 0.0, {}, "calibrating the angle"))
+
+    calibrated = calibrate(networks, cases, renderer, tell)
+    save_networks(out / preset, calibrated, {**networks.about, "calibrated_on": len(cases)})
+
+
+def _make(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"the folder {out} cannot be made: {error.strerror}.") from error
 
 
 def make_task(config: TrainConfig, sources: Sources) -> Task:

@@ -17,7 +17,7 @@ from posekit.nets.weights import Networks, save_networks
 from posekit.object_model import ObjectModel
 from posekit.render import Renderer
 from posekit.train.config import TrainConfig
-from posekit.train.measure import Case, bop_cases, held_back_cases, measure
+from posekit.train.measure import Case, CaseSource, bop_cases, measure, rendered_cases
 from posekit.train.sources import Sources
 
 
@@ -71,8 +71,8 @@ class PoseTask:
     @cached_property
     def cases(self) -> list[Case]:
         stream = self.config.stream
-        return held_back_cases(self.renderer, self.models, self.sources.photos, stream.scenes, stream.augment,
-                               self.config.cases)  # fmt: skip
+        source = CaseSource(self.models, self.sources.photos, stream.scenes, stream.augment)
+        return rendered_cases(source, self.renderer, self.config.cases)
 
     @cached_property
     def bop(self) -> list[Case]:
