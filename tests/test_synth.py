@@ -343,6 +343,23 @@ def test_rooms_are_traced_where_masks_are(tmp_path: Path, renderer: Renderer) ->
     assert np.ptp(data.view(1, 0).image) > 60
 
 
+def test_environments_from_files_light_the_rooms(tmp_path: Path) -> None:
+    """Under a red sky a picture is redder than under a blue one."""
+    redness = []
+    for colour in ((0.0, 0.0, 9.0), (9.0, 0.0, 0.0)):
+        folder = tmp_path / f"sky{len(redness)}"
+        folder.mkdir()
+        cv2.imwrite(str(folder / "sky.hdr"), np.full((8, 16, 3), colour, np.float32))  # BGR
+        what = config("photoreal", 1, size=(32, 32), samples=4, views=1, variant="scalar_rgb", hdri=str(folder))
+        data = make(tmp_path / f"set{len(redness)}", what)
+        red, _, blue = data.view(1, 0).image.reshape(-1, 3).mean(axis=0)
+        redness.append(red - blue)
+    assert redness[0] > redness[1] + 5
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"holds no .exr or .hdr"):
+        make(tmp_path / "no", config("photoreal", 1, variant="scalar_rgb", hdri=str(tmp_path / "empty")))
+
+
 def test_what_photoreal_needs_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     from posekit.data.synth import photoreal
 
