@@ -154,14 +154,53 @@ def test_masks_are_dilated_beside(tmp_path: Path) -> None:
         assert (grown >= mask).all()
 
 
-def test_a_sequence_moves_smoothly(tmp_path: Path) -> None:
-    data = make(tmp_path / "set", config("sequence", 8, frames=4))
-    assert data.scenes() == [1, 2]
-    for scene in data.scenes():
-        first = [data.instances(scene, image, every=True)[0].T_cam_obj for image in range(4)]
-        for a, b in itertools.pairwise(first):
-            turn, shift = pose_error(a, b)
-            assert 0 < turn < 0.3 and shift < 0.05
+def steps(data: BopDataset) -> list[tuple[float, float]]:
+    """Turns (radians) and shifts (metres) of the first object from frame to frame."""
+    poses = [data.instances(scene, image, every=True)[0].T_cam_obj for scene, image in data.images()]
+    return [pose_error(a, b) for a, b in itertools.pairwise(poses)]
+
+
+def test_sequences_move_as_they_say(tmp_path: Path) -> None:
+    """Still ones not at all, fast ones more than slow ones, jerky ones in bursts; all in scenes of their own."""
+
+    def of(motion: str) -> list[tuple[float, float]]:
+        return steps(make(tmp_path / motion, config("sequence", 16, frames=16, size=(64, 48), motion=motion)))
+
+    assert all(turn < 1e-6 and shift < 1e-9 for turn, shift in of("still"))
+    slow, smooth, fast, jerky = (np.array(of(m))[:, 0] for m in ("slow", "smooth", "fast", "jerky"))
+    assert 0 < slow.max() < smooth.max() < fast.max() < 0.6
+    assert 4 * np.abs(np.diff(smooth)).max() < np.abs(np.diff(jerky)).max()
+    mixed = make(tmp_path / "mixed", config("sequence", 8, frames=1))
+    assert mixed.scenes() == list(range(1, 9))
+    told = json.loads((tmp_path / "mixed" / "sequences.json").read_text())
+    assert [told[str(n)]["motion"] for n in (1, 2, 7, 8)] == ["still", "slow", "leaving", "still"]
+
+
+def test_what_leaves_a_sequence_has_no_truth_until_it_is_back(tmp_path: Path) -> None:
+    data = make(tmp_path / "set", config("sequence", 20, frames=20, motion="leaving"))
+    counts = [len(data.instances(scene, image, every=True)) for scene, image in data.images()]
+    assert len(counts) == 20
+    assert counts[0] == counts[-1] > 0 and counts[8:13] == [0] * 5
+    truths = json.loads((tmp_path / "set" / "train" / "000001" / "scene_gt.json").read_text())
+    assert truths["10"] == [] and truths["0"] and not list((tmp_path / "set").rglob("mask/000010_*"))
+
+
+def test_what_passes_in_a_sequence_hides(tmp_path: Path) -> None:
+    data = make(tmp_path / "set", config("sequence", 15, frames=15, motion="hidden"))
+    first = min(i.obj_id for i in data.instances(1, 0, every=True))
+    seen = [i.visib_fract for n in range(15) for i in data.instances(1, n, every=True) if i.obj_id == first]
+    assert min(seen) < 0.6 * max(seen)
+
+
+def test_fast_sequences_are_blurred(tmp_path: Path) -> None:
+    """The same scene at the same moment: what moves has softer edges than what stands still."""
+    sharpness = {}
+    for motion in ("still", "fast"):
+        data = make(tmp_path / motion, config("sequence", 1, frames=1, motion=motion, size=(320, 240)))
+        mask = np.any([i.mask() for i in data.instances(1, 0, every=True)], axis=0)
+        edges = cv2.Laplacian(cv2.cvtColor(data.view(1, 0).image, cv2.COLOR_RGB2GRAY), cv2.CV_32F, ksize=3)
+        sharpness[motion] = float(np.abs(edges[mask]).mean())
+    assert sharpness["fast"] < 0.9 * sharpness["still"]
 
 
 def test_backgrounds(tmp_path: Path) -> None:
@@ -242,6 +281,8 @@ def test_command_errors(tmp_path: Path, meshes: Path) -> None:
 def test_settings_that_make_no_sense(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="the kind is one of"):
         SynthConfig("other", 1)
+    with pytest.raises(ConfigError, match="the motion is mixed or one of still"):
+        SynthConfig("sequence", 1, motion="wild")
     with pytest.raises(ConfigError, match="needs objects"):
         begin(config("randomised", 1), tmp_path / "set", {})
     (tmp_path / "synth.json").write_text("{}")
