@@ -28,6 +28,7 @@ from posekit.data.synth.backdrops import Backdrops
 from posekit.data.synth.plan import SynthConfig
 from posekit.data.synth.run import Machines, begin, run
 from posekit.errors import ConfigError, InputError, OutputError
+from posekit.evaluate.bop_results import ResultRow, results_csv
 from posekit.metrics import pose_error
 from posekit.object_model import ObjectModel
 from posekit.render import Renderer
@@ -89,6 +90,23 @@ def test_its_own_truth_is_right(kind: str, tmp_path: Path, renderer: Renderer) -
             inside = visible & drawn.mask
             np.testing.assert_allclose(units[inside] * 1e-4, drawn.depth[inside], atol=2e-4)
     assert checked > 0
+
+
+@pytest.mark.parametrize("kind", ["randomised", "scenes", "sequence", "photoreal"])
+def test_its_own_truth_scores_exactly_100(kind: str, tmp_path: Path) -> None:
+    what = config(kind, 2, size=(96, 72), samples=1, views=2, variant="scalar_rgb", split="test")
+    data = make(tmp_path / "set", what)
+    found = [i for scene, image in data.images() for i in data.instances(scene, image, every=True)]
+    rows = [ResultRow(i.scene, i.image, i.obj_id, i.visib_fract, i.T_cam_obj.R, i.T_cam_obj.t, 0.5) for i in found]
+    csv = tmp_path / "truth.csv"
+    csv.write_text(results_csv(rows))
+    arguments = ["eval", "--stage", "score", "--root", data.root, "--csv", csv, "--out", tmp_path / "out"]
+    result = CliRunner().invoke(app, [*map(str, arguments)])
+    assert result.exit_code == 0, result.output
+    results = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert results["counts"]["instances"] > 0 and results["counts"]["missing"] == 0
+    for key in ("2deg_2cm", "add_01d", "vsd_ar", "mssd_ar", "mspd_ar", "ar"):
+        assert results["pooled"][key] == 100.0
 
 
 def test_several_workers_make_the_same_images(tmp_path: Path) -> None:
@@ -323,6 +341,23 @@ def test_rooms_are_traced_where_masks_are(tmp_path: Path, renderer: Renderer) ->
     again = make(tmp_path / "again", what)
     assert digest(again.root) == digest(data.root)
     assert np.ptp(data.view(1, 0).image) > 60
+
+
+def test_environments_from_files_light_the_rooms(tmp_path: Path) -> None:
+    """Under a red sky a picture is redder than under a blue one."""
+    redness = []
+    for colour in ((0.0, 0.0, 9.0), (9.0, 0.0, 0.0)):
+        folder = tmp_path / f"sky{len(redness)}"
+        folder.mkdir()
+        cv2.imwrite(str(folder / "sky.hdr"), np.full((8, 16, 3), colour, np.float32))  # BGR
+        what = config("photoreal", 1, size=(32, 32), samples=4, views=1, variant="scalar_rgb", hdri=str(folder))
+        data = make(tmp_path / f"set{len(redness)}", what)
+        red, _, blue = data.view(1, 0).image.reshape(-1, 3).mean(axis=0)
+        redness.append(red - blue)
+    assert redness[0] > redness[1] + 5
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"holds no .exr or .hdr"):
+        make(tmp_path / "no", config("photoreal", 1, variant="scalar_rgb", hdri=str(tmp_path / "empty")))
 
 
 def test_what_photoreal_needs_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
