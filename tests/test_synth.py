@@ -28,6 +28,7 @@ from posekit.data.synth.backdrops import Backdrops
 from posekit.data.synth.plan import SynthConfig
 from posekit.data.synth.run import Machines, begin, run
 from posekit.errors import ConfigError, InputError, OutputError
+from posekit.evaluate.bop_results import ResultRow, results_csv
 from posekit.metrics import pose_error
 from posekit.object_model import ObjectModel
 from posekit.render import Renderer
@@ -89,6 +90,23 @@ def test_its_own_truth_is_right(kind: str, tmp_path: Path, renderer: Renderer) -
             inside = visible & drawn.mask
             np.testing.assert_allclose(units[inside] * 1e-4, drawn.depth[inside], atol=2e-4)
     assert checked > 0
+
+
+@pytest.mark.parametrize("kind", ["randomised", "scenes", "sequence", "photoreal"])
+def test_its_own_truth_scores_exactly_100(kind: str, tmp_path: Path) -> None:
+    what = config(kind, 2, size=(96, 72), samples=1, views=2, variant="scalar_rgb", split="test")
+    data = make(tmp_path / "set", what)
+    found = [i for scene, image in data.images() for i in data.instances(scene, image, every=True)]
+    rows = [ResultRow(i.scene, i.image, i.obj_id, i.visib_fract, i.T_cam_obj.R, i.T_cam_obj.t, 0.5) for i in found]
+    csv = tmp_path / "truth.csv"
+    csv.write_text(results_csv(rows))
+    arguments = ["eval", "--stage", "score", "--root", data.root, "--csv", csv, "--out", tmp_path / "out"]
+    result = CliRunner().invoke(app, [*map(str, arguments)])
+    assert result.exit_code == 0, result.output
+    results = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert results["counts"]["instances"] > 0 and results["counts"]["missing"] == 0
+    for key in ("2deg_2cm", "add_01d", "vsd_ar", "mssd_ar", "mspd_ar", "ar"):
+        assert results["pooled"][key] == 100.0
 
 
 def test_several_workers_make_the_same_images(tmp_path: Path) -> None:
@@ -154,14 +172,53 @@ def test_masks_are_dilated_beside(tmp_path: Path) -> None:
         assert (grown >= mask).all()
 
 
-def test_a_sequence_moves_smoothly(tmp_path: Path) -> None:
-    data = make(tmp_path / "set", config("sequence", 8, frames=4))
-    assert data.scenes() == [1, 2]
-    for scene in data.scenes():
-        first = [data.instances(scene, image, every=True)[0].T_cam_obj for image in range(4)]
-        for a, b in itertools.pairwise(first):
-            turn, shift = pose_error(a, b)
-            assert 0 < turn < 0.3 and shift < 0.05
+def steps(data: BopDataset) -> list[tuple[float, float]]:
+    """Turns (radians) and shifts (metres) of the first object from frame to frame."""
+    poses = [data.instances(scene, image, every=True)[0].T_cam_obj for scene, image in data.images()]
+    return [pose_error(a, b) for a, b in itertools.pairwise(poses)]
+
+
+def test_sequences_move_as_they_say(tmp_path: Path) -> None:
+    """Still ones not at all, fast ones more than slow ones, jerky ones in bursts; all in scenes of their own."""
+
+    def of(motion: str) -> list[tuple[float, float]]:
+        return steps(make(tmp_path / motion, config("sequence", 16, frames=16, size=(64, 48), motion=motion)))
+
+    assert all(turn < 1e-6 and shift < 1e-9 for turn, shift in of("still"))
+    slow, smooth, fast, jerky = (np.array(of(m))[:, 0] for m in ("slow", "smooth", "fast", "jerky"))
+    assert 0 < slow.max() < smooth.max() < fast.max() < 0.6
+    assert 4 * np.abs(np.diff(smooth)).max() < np.abs(np.diff(jerky)).max()
+    mixed = make(tmp_path / "mixed", config("sequence", 8, frames=1))
+    assert mixed.scenes() == list(range(1, 9))
+    told = json.loads((tmp_path / "mixed" / "sequences.json").read_text())
+    assert [told[str(n)]["motion"] for n in (1, 2, 7, 8)] == ["still", "slow", "leaving", "still"]
+
+
+def test_what_leaves_a_sequence_has_no_truth_until_it_is_back(tmp_path: Path) -> None:
+    data = make(tmp_path / "set", config("sequence", 20, frames=20, motion="leaving"))
+    counts = [len(data.instances(scene, image, every=True)) for scene, image in data.images()]
+    assert len(counts) == 20
+    assert counts[0] == counts[-1] > 0 and counts[8:13] == [0] * 5
+    truths = json.loads((tmp_path / "set" / "train" / "000001" / "scene_gt.json").read_text())
+    assert truths["10"] == [] and truths["0"] and not list((tmp_path / "set").rglob("mask/000010_*"))
+
+
+def test_what_passes_in_a_sequence_hides(tmp_path: Path) -> None:
+    data = make(tmp_path / "set", config("sequence", 15, frames=15, motion="hidden"))
+    first = min(i.obj_id for i in data.instances(1, 0, every=True))
+    seen = [i.visib_fract for n in range(15) for i in data.instances(1, n, every=True) if i.obj_id == first]
+    assert min(seen) < 0.6 * max(seen)
+
+
+def test_fast_sequences_are_blurred(tmp_path: Path) -> None:
+    """The same scene at the same moment: what moves has softer edges than what stands still."""
+    sharpness = {}
+    for motion in ("still", "fast"):
+        data = make(tmp_path / motion, config("sequence", 1, frames=1, motion=motion, size=(320, 240)))
+        mask = np.any([i.mask() for i in data.instances(1, 0, every=True)], axis=0)
+        edges = cv2.Laplacian(cv2.cvtColor(data.view(1, 0).image, cv2.COLOR_RGB2GRAY), cv2.CV_32F, ksize=3)
+        sharpness[motion] = float(np.abs(edges[mask]).mean())
+    assert sharpness["fast"] < 0.9 * sharpness["still"]
 
 
 def test_backgrounds(tmp_path: Path) -> None:
@@ -242,6 +299,8 @@ def test_command_errors(tmp_path: Path, meshes: Path) -> None:
 def test_settings_that_make_no_sense(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="the kind is one of"):
         SynthConfig("other", 1)
+    with pytest.raises(ConfigError, match="the motion is mixed or one of still"):
+        SynthConfig("sequence", 1, motion="wild")
     with pytest.raises(ConfigError, match="needs objects"):
         begin(config("randomised", 1), tmp_path / "set", {})
     (tmp_path / "synth.json").write_text("{}")
@@ -282,6 +341,23 @@ def test_rooms_are_traced_where_masks_are(tmp_path: Path, renderer: Renderer) ->
     again = make(tmp_path / "again", what)
     assert digest(again.root) == digest(data.root)
     assert np.ptp(data.view(1, 0).image) > 60
+
+
+def test_environments_from_files_light_the_rooms(tmp_path: Path) -> None:
+    """Under a red sky a picture is redder than under a blue one."""
+    redness = []
+    for colour in ((0.0, 0.0, 9.0), (9.0, 0.0, 0.0)):
+        folder = tmp_path / f"sky{len(redness)}"
+        folder.mkdir()
+        cv2.imwrite(str(folder / "sky.hdr"), np.full((8, 16, 3), colour, np.float32))  # BGR
+        what = config("photoreal", 1, size=(32, 32), samples=4, views=1, variant="scalar_rgb", hdri=str(folder))
+        data = make(tmp_path / f"set{len(redness)}", what)
+        red, _, blue = data.view(1, 0).image.reshape(-1, 3).mean(axis=0)
+        redness.append(red - blue)
+    assert redness[0] > redness[1] + 5
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"holds no .exr or .hdr"):
+        make(tmp_path / "no", config("photoreal", 1, variant="scalar_rgb", hdri=str(tmp_path / "empty")))
 
 
 def test_what_photoreal_needs_is_said(monkeypatch: pytest.MonkeyPatch) -> None:

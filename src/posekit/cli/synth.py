@@ -59,6 +59,10 @@ def synth(
         Path | None, typer.Option(metavar="DIR", help="Environments (.exr, .hdr) of photoreal.", rich_help_panel=LOOK)
     ] = None,
     frames: Annotated[int, typer.Option(help="Of a sequence.", rich_help_panel=LOOK)] = 100,
+    motion: Annotated[
+        Literal["mixed", "still", "slow", "smooth", "fast", "jerky", "hidden", "leaving"],
+        typer.Option(help="Of sequences; mixed: each in its turn.", rich_help_panel=LOOK),
+    ] = "mixed",
     views: Annotated[int, typer.Option(help="Of a photoreal room.", rich_help_panel=LOOK)] = 4,
     samples: Annotated[int, typer.Option(help="Light paths per pixel of photoreal.", rich_help_panel=LOOK)] = 32,
     variant: Annotated[
@@ -90,7 +94,7 @@ def synth(
         count = images or (PER_OBJECT * len(objects) if kind == "randomised" else DEFAULT)
         config = SynthConfig(
             kind, count, seed, split, _parse_size(size), quality, _text(backgrounds), _text(hdri), frames, views,
-            samples, variant,
+            samples, variant, motion,
         )  # fmt: skip
         begin(config, out, objects)
     with _bar() as show:

@@ -248,19 +248,19 @@ def _of_assigned(group: _Group, pair_errors: Array, found: NDArray[np.int64]) ->
 
 def _recall(group: _Group, pair_errors: Array, thresholds: Array) -> Array:
     """For each case the share of the thresholds at which BOP's matching finds it."""
-    share = np.zeros(len(group.cases))
+    found = np.zeros(len(group.cases), dtype=np.int64)
     for cs, gs, errors in _block_errors(group, pair_errors):
         counted = [k for k, c in enumerate(cs) if group.cases[c].counted]
         top = errors[: len(counted)][:, counted]
         if len(counted) == 1 and len(top):
-            share[cs[counted[0]]] = (top[0, 0] < thresholds).mean()
+            found[cs[counted[0]]] = (top[0, 0] < thresholds).sum()
             continue
         scores = [group.guesses[g].score for g in gs[: len(counted)]]
         for threshold in thresholds:
             matched = metrics.match(top, scores, threshold)
             for m in matched[matched >= 0]:
-                share[cs[counted[m]]] += 1 / len(thresholds)
-    return share
+                found[cs[counted[m]]] += 1
+    return found / len(thresholds)
 
 
 def _vsd_recall(group: _Group, vsd: VsdErrors) -> Array:

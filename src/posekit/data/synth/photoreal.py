@@ -174,7 +174,8 @@ class Photoreal:
         scene: dict[str, Any] = {"type": "scene"}
         for k, (obj_id, _, pose) in enumerate(kept):
             scene[f"object{k}"] = self._mesh(obj_id, pose, rng)
-        scene |= self._surfaces(unit, rng) | self._lights(unit, rng)
+        others = self._surfaces(unit, rng) | self._lights(unit, rng)
+        scene |= {name: self.mi.load_dict(what) for name, what in others.items()}  # from one dict their order is chance
         return Room(kept, unit, scene)
 
     def _mesh(self, obj_id: int, pose: Pose, rng: Rng) -> Any:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Protocol
 
 from posekit.data.bop_writer import Picture
+from posekit.data.synth.motion import MIXED, MOTIONS
 from posekit.errors import ConfigError, InputError
 
 KINDS = ("randomised", "photoreal", "scenes", "sequence")
@@ -21,7 +22,7 @@ CONFIG = "synth.json"
 class SynthConfig:
     """images: in all. size: (width, height). quality: of JPEG, percent; 0 = PNG. frames: in a sequence. views: of a
     photoreal room. samples: light paths for each pixel. variant: Mitsuba's, "auto" = the fastest one here.
-    backgrounds, hdri: folders; empty = procedural ones."""
+    backgrounds, hdri: folders; empty = procedural ones. motion: of sequences, "mixed" = each of `MOTIONS` in turn."""
 
     kind: str
     images: int
@@ -35,10 +36,13 @@ class SynthConfig:
     views: int = 4
     samples: int = 32
     variant: str = "auto"
+    motion: str = MIXED
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise ConfigError(f"the kind is one of {', '.join(KINDS)}, not {self.kind!r}.")
+        if self.motion != MIXED and self.motion not in MOTIONS:
+            raise ConfigError(f"the motion is {MIXED} or one of {', '.join(MOTIONS)}, not {self.motion!r}.")
         if min(self.images, self.frames, self.views, self.samples) < 1:
             raise ConfigError("images, frames, views and samples are at least 1.")
         if min(self.size) < 32 or max(self.size) > 4096:

@@ -77,6 +77,10 @@ def run(root: Path, machines: Machines, show: Show, shard: int = 0) -> int:
     if not complete:
         _remove_leftovers(root)
         writer.finish(_names(root), f"posekit synth --kind {config.kind} --seed {config.seed}")
+        if config.kind == "sequence":
+            from posekit.data.synth.sequence import sequences
+
+            _write_json(root / "sequences.json", sequences(config))
         write_report(root, config.split)
     if shard:
         write_shards(root, config.split, shard)
