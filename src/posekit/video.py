@@ -5,7 +5,6 @@ from __future__ import annotations
 import glob
 import json
 import logging
-import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
@@ -285,4 +284,4 @@ class VideoWriter:
             return
         self._container.mux(self._stream.encode())  # type: ignore[attr-defined]
         self._container.close()
-        os.replace(self.part, self.path)  # what was tracked before an interruption is kept
+        self.part.replace(self.path)  # what was tracked before an interruption is kept
