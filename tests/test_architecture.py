@@ -17,7 +17,7 @@ LAYERS = {
     0: {"geometry", "camera", "files"},
     1: {"view", "object_model", "results"},
     2: {"load", "zoom", "metrics", "pnp", "render", "nets", "detect", "draw"},
-    3: {"data", "refine", "hypotheses", "figures", "video"},
+    3: {"data", "refine", "hypotheses", "figures", "odometry", "video"},
     4: {"estimate", "novel"},
     5: {"search", "track", "evaluate", "train"},
     6: {"cli"},
@@ -38,6 +38,7 @@ DOORS = {
     "huggingface_hub": {"data"},
     "pycocotools": {"detect"},
     "av": {"video"},
+    "openvino": {"nets", "cli"},
 }
 
 ROOM_LAYER = {room: layer for layer, rooms in LAYERS.items() for room in rooms}

@@ -98,11 +98,10 @@ class PoseEstimator:
             estimates.append(self._choose(masked, refined, detection, timings))
         return estimates
 
-    def refine(self, view: View, T_cam_obj: Pose, options: RefineOptions | None = None) -> Estimate:
-        """Refine a known pose; view.mask, where there is one, helps. options: in place of the estimator's."""
+    def refine(self, view: View, T_cam_obj: Pose) -> Estimate:
+        """Refine a known pose; view.mask, where there is one, helps."""
         started = time.perf_counter()
-        chosen = options or self.options.refine_options
-        refined = refine(view, self.model, [T_cam_obj], self.predictor, self.renderer, chosen)
+        refined = refine(view, self.model, [T_cam_obj], self.predictor, self.renderer, self.options.refine_options)
         seconds = time.perf_counter() - started
         return self._choose(view, refined, None, {"refine": seconds, "total": seconds})
 

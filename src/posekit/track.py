@@ -1,11 +1,14 @@
 """Tracker: the last pose seeds the next frame's. Layer 5.
 
 Paper, section 3.4: the first frame is estimated and refined; each next frame starts from the last pose. A predicted
-angle above 25 degrees restarts with a new first pose, one below 2 degrees leaves the pose as it is.
+angle above 25 degrees restarts with a new first pose, one below 2 degrees leaves the pose as it is. What goes beyond
+the paper, and why, is in docs/tracking.md.
 """
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -16,14 +19,18 @@ from numpy.typing import NDArray
 from posekit.camera import Camera
 from posekit.errors import CameraError, ConfigError
 from posekit.estimate import PoseEstimator
-from posekit.geometry import Pose, so3_exp, so3_log
+from posekit.geometry import Pose, rotation_angle, so3_exp, so3_log
+from posekit.hypotheses import agreements
+from posekit.nets.predictor import PairPrediction, Predictor
 from posekit.object_model import ObjectModel
-from posekit.refine import RefineOptions
+from posekit.odometry import follow_points
+from posekit.refine import compare, predicted_angle, update_pose
 from posekit.results import Detection, Estimate
 from posekit.view import View
 
 TRACKED, RESTARTED, LOST = "tracked", "restarted", "lost"
-MASKS = ("pose", "none")
+MASKS, MOTIONS, RUNTIMES = ("pose", "none"), ("points", "velocity", "none"), ("openvino", "torch")
+NEAR = 0.6  # diameters, the least distance of an object's centre that is believed
 
 
 class Finder(Protocol):
@@ -33,39 +40,50 @@ class Finder(Protocol):
 
 
 @dataclass(frozen=True)
-class TrackOptions:
-    """restart_deg, stop_deg: predicted angles of the paper, degrees. iterations: of a frame at most. prior: share of
-    the last frame's motion that the next one is expected to repeat; 0 = none. mask: what a frame's mask is taken to be,
-    the silhouette at the expected pose ("pose") or nothing ("none"). least: score (as of an Estimate, without a mask)
-    below which the pose is not believed. doubts: frames in a row that it may not be believed. search: frames between
-    two attempts to find an object that is lost. first: least score of a first pose."""
+class TrackConfig:
+    """restart_deg: predicted angle that restarts. still_deg: turn below which the comparison leaves the pose as it is,
+    both degrees. iterations: comparisons of a frame at most; a second one follows a turn of more than ``again_deg``.
+    motion: where a frame's comparison starts: where followed points lead ("points"), the share ``prior`` of the last
+    motion once more ("velocity"), or the last pose ("none"). mask: what a frame's mask is taken to be, the silhouette
+    where the comparison starts ("pose") or nothing ("none"). gain: share of the comparison's update that is made.
+    least_colour: correlation of colours with the mesh's below which a pose is in doubt. least_inside: share of the
+    silhouette's box in the picture, likewise. doubts: frames in a row after which the object is lost. search: frames
+    between two attempts to find it. first: least score of a first pose. runtime: of the network."""
 
     restart_deg: float = 25.0
-    stop_deg: float = 2.0
-    iterations: int = 2
-    prior: float = 0.5
+    still_deg: float = 0.0
+    again_deg: float = 8.0
+    iterations: int = 1
+    motion: str = "points"
+    prior: float = 0.7
     mask: str = "pose"
-    least: float = 0.55
+    gain: float = 0.2
+    least_colour: float = 0.1
+    least_inside: float = 0.3
     doubts: int = 3
-    search: int = 10
+    search: int = 5
     first: float = 0.35
+    runtime: str = "openvino"
 
     def __post_init__(self) -> None:
-        if not 0 < self.stop_deg < self.restart_deg <= 180:
+        if not 0 <= self.still_deg < self.restart_deg <= 180:
             raise ConfigError(
-                f"the stop angle is above 0 and below the restart angle, which is at most 180 degrees; not "
-                f"{self.stop_deg:g} and {self.restart_deg:g}."
+                f"the angle that leaves a pose is from 0 on and below the one that restarts, which is at most 180 "
+                f"degrees; not {self.still_deg:g} and {self.restart_deg:g}."
             )
-        if min(self.iterations, self.doubts, self.search) < 1 or not 0 <= self.prior <= 1:
-            raise ConfigError("iterations, doubts and search are at least 1, and prior is in [0, 1].")
-        if self.mask not in MASKS:
-            raise ConfigError(f"mask is one of {', '.join(MASKS)}, not {self.mask!r}.")
+        if min(self.iterations, self.doubts, self.search) < 1:
+            raise ConfigError("iterations, doubts and search are at least 1.")
+        if not (0 <= self.prior <= 1 and 0 <= self.gain <= 1 and 0 <= self.least_inside <= 1):
+            raise ConfigError("prior, gain and least_inside are shares between 0 and 1.")
+        for name, known in (("mask", MASKS), ("motion", MOTIONS), ("runtime", RUNTIMES)):
+            if getattr(self, name) not in known:
+                raise ConfigError(f"{name} is one of {', '.join(known)}, not {getattr(self, name)!r}.")
 
 
 @dataclass(frozen=True, eq=False)
 class Tracked:
     """What a frame says about the object. state: "tracked", "restarted" (a new first pose) or "lost". estimate: None
-    where it is lost."""
+    where it is lost; its score is the confidence, the correlation of colours with the mesh's."""
 
     state: str
     estimate: Estimate | None = None
@@ -85,7 +103,8 @@ class Tracker:
 
     camera: of all frames, unless `step` is given another. pose: ``T_cam_obj`` in the first frame, where it is known.
     estimator: of this model; made with the shipped weights where it is not given. detector: finds the object in the
-    first frame and when it is lost; without one a lost object stays lost.
+    first frame and when it is lost; without one a lost object stays lost. predictor: in place of the one that
+    ``config.runtime`` names.
     Not thread-safe: one tracker per thread. Raises ConfigError where neither pose nor detector is given.
     """
 
@@ -97,15 +116,19 @@ class Tracker:
         pose: Pose | None = None,
         estimator: PoseEstimator | None = None,
         detector: Finder | None = None,
-        options: TrackOptions = TrackOptions(),
+        predictor: Predictor | None = None,
+        config: TrackConfig = TrackConfig(),
     ) -> None:
         if pose is None and detector is None:
             raise ConfigError("a tracker needs the first pose, or a detector that finds the object.")
-        self.model, self.camera, self.options = model, camera, options
+        self.model, self.camera, self.config = model, camera, config
         self.estimator = estimator or PoseEstimator(model)
-        self.detector = detector
+        self.predictor = predictor or _predictor(self.estimator, config)
+        self.renderer, self.detector = self.estimator.renderer, detector
+        self._outline = model.outline - model.center
         self._pose = pose
         self._motion = Pose.identity()  # of the object's centre and axes, from the frame before the last to the last
+        self._before: View | None = None
         self._doubts = 0
         self._waiting = 0  # frames until the next search
 
@@ -115,64 +138,129 @@ class Tracker:
         if chosen is None:
             raise CameraError("the tracker was made without a camera: pass one with each frame.")
         view = View(image, chosen)
+        last, found = self._pose, None
+        if last is not None:
+            found = self._follow(view, last)
+            if found is None or math.degrees(found.angle) > self.config.restart_deg or self._lost_sight(view, found):
+                self._lose()
         if self._pose is None:
             return self._find(view)
-        found = self._follow(view, self._pose)
-        if found is None or found.angle > np.deg2rad(self.options.restart_deg):
-            self._lose()
-            return self._find(view)
-        self._doubts = 0 if found.score >= self.options.least else self._doubts + 1
-        if self._doubts >= self.options.doubts:
-            self._lose()
-            return self._find(view)
-        self._motion = self._moved(self._pose, found.T_cam_obj)
-        self._pose = found.T_cam_obj
+        assert last is not None and found is not None
+        self._motion = self._moved(last, found.T_cam_obj)
+        self._pose, self._before = found.T_cam_obj, view
         return Tracked(TRACKED, found)
 
-    # --- inside ---
+    # --- following ---
 
     def _follow(self, view: View, last: Pose) -> Estimate | None:
-        """Refined from where the object is expected; None where it has left the picture."""
-        start = self._expected(last)
-        options = self.options
-        seen = view
-        if options.mask == "pose":
-            [drawn] = self.estimator.renderer.render(self.model, [start], view.camera, rgb=False, coords=False)
-            assert drawn.mask is not None
-            if not drawn.mask.any():
+        """From where the object is expected; None where it cannot be compared."""
+        started = time.perf_counter()
+        pose, angle, network = self._expected(view, last), 0.0, 0.0
+        for k in range(self.config.iterations):
+            if not self._in_front(pose):
                 return None
-            seen = view.with_mask(drawn.mask)
-        update = "correspondence" if self.estimator.predictor.dense else "regression"
-        loop = RefineOptions(update, "angle", options.iterations, float(np.deg2rad(options.stop_deg)), patience=50)
-        found = self.estimator.refine(seen, start, loop)
-        height, width = view.image.shape[:2]
-        x0, y0, x1, y1 = found.box
-        gone = x1 <= 0 or y1 <= 0 or x0 >= width or y0 >= height
-        return None if gone else found
+            updated, angle, seconds = self._compared(view, pose)
+            network += seconds
+            if updated is None:
+                return None
+            turn = math.degrees(rotation_angle(updated.R @ pose.R.T))
+            if turn >= self.config.still_deg:
+                pose = self._between(pose, updated)
+            if turn < self.config.again_deg or k + 1 == self.config.iterations:
+                break
+        if not self._in_front(pose):
+            return None
+        [seen] = agreements(view, self.model, [pose], self.renderer, self.predictor.size)
+        timings = {"network": network, "total": time.perf_counter() - started}
+        box = view.camera.points_box(_before_camera(pose.apply(self.model.outline)))
+        return Estimate(pose, angle, k + 1, True, max(0.0, seen.colour), box, self.model.name, timings=timings)
 
-    def _expected(self, last: Pose) -> Pose:
-        """Constant velocity, damped: the share ``prior`` of the last motion once more, about the object's centre."""
-        share = self.options.prior
+    def _compared(self, view: View, pose: Pose) -> tuple[Pose | None, float, float]:
+        """The pose after one prediction, the predicted angle, and the seconds that the network took."""
+        masking = _Masking(self.predictor, self.config.mask == "pose")
+        [prediction], [seen], [drawn] = compare(view, self.model, self._outline, [pose], masking, self.renderer)
+        update = "correspondence" if self.predictor.dense else "regression"
+        updated = update_pose(pose, self.model, prediction, seen, drawn, update)
+        return updated, predicted_angle(pose, prediction, updated, update), masking.seconds
+
+    def _expected(self, view: View, last: Pose) -> Pose:
+        """Where the object should be in this frame, by ``config.motion``."""
+        if self.config.motion == "points":
+            if self._before is None or self._before.camera.size != view.camera.size:
+                return last
+            return follow_points(self._before, view, last, self.model, self.renderer).pose or last
+        share = self.config.prior if self.config.motion == "velocity" else 0.0
         centred = last @ self.model.T_obj_ctr
         R = so3_exp(so3_log(self._motion.R) * share) @ centred.R
         return Pose(R, centred.t + share * self._motion.t) @ self.model.T_obj_ctr.inverse()
+
+    def _between(self, pose: Pose, updated: Pose) -> Pose:
+        """The share ``gain`` of the way, about the object's centre."""
+        a, b, gain = pose @ self.model.T_obj_ctr, updated @ self.model.T_obj_ctr, self.config.gain
+        R = so3_exp(gain * so3_log(b.R @ a.R.T)) @ a.R
+        return Pose(R, a.t + gain * (b.t - a.t)) @ self.model.T_obj_ctr.inverse()
 
     def _moved(self, before: Pose, after: Pose) -> Pose:
         a, b = before @ self.model.T_obj_ctr, after @ self.model.T_obj_ctr
         return Pose(b.R @ a.R.T, b.t - a.t)
 
+    def _in_front(self, pose: Pose) -> bool:
+        return bool(np.isfinite(pose.matrix).all() and pose.apply(self.model.center)[2] > NEAR * self.model.diameter)
+
+    # --- losing and finding ---
+
+    def _lost_sight(self, view: View, found: Estimate) -> bool:
+        """Whether too little of the object has been seen for too long; at once where it is outside the picture."""
+        x0, y0, x1, y1 = found.box
+        width, height = view.camera.size
+        inside = max(0.0, min(x1, width) - max(x0, 0.0)) * max(0.0, min(y1, height) - max(y0, 0.0))
+        share = inside / max((x1 - x0) * (y1 - y0), 1e-9)
+        doubted = share < self.config.least_inside or found.score < self.config.least_colour
+        self._doubts = self._doubts + 1 if doubted else 0
+        return share == 0 or self._doubts >= self.config.doubts
+
     def _lose(self) -> None:
-        self._pose, self._motion, self._doubts, self._waiting = None, Pose.identity(), 0, 0
+        self._pose, self._before, self._motion = None, None, Pose.identity()
+        self._doubts = self._waiting = 0
 
     def _find(self, view: View) -> Tracked:
         """A new first pose, where there is one. A search takes seconds, so not every frame is searched."""
         self._waiting -= 1
         if self.detector is None or self._waiting > 0:
             return Tracked(LOST)
-        self._waiting = self.options.search
+        self._waiting = self.config.search
         detections = [d for d in self.detector.detect(view, [self.model]) if d.label in (None, self.model.name)]
         found = max(self.estimator.estimate(view, detections), key=lambda e: e.score, default=None)
-        if found is None or found.score < self.options.first:
+        if found is None or found.score < self.config.first:
             return Tracked(LOST)
-        self._pose, self._waiting = found.T_cam_obj, 0
+        self._pose, self._before, self._waiting = found.T_cam_obj, view, 0
         return Tracked(RESTARTED, found)
+
+
+class _Masking:
+    """A predictor that is given the rendered mask as the observed one, or none, and that counts its seconds."""
+
+    def __init__(self, predictor: Predictor, rendered: bool) -> None:
+        self.predictor, self.rendered, self.seconds = predictor, rendered, 0.0
+        self.size, self.dense = predictor.size, predictor.dense
+
+    def predict(self, observed: Sequence[View], rendered: Sequence[View]) -> list[PairPrediction]:
+        pairs = zip(observed, rendered, strict=True)
+        seen = [view.with_mask(drawn.mask if self.rendered else None) for view, drawn in pairs]
+        started = time.perf_counter()
+        answers = self.predictor.predict(seen, rendered)
+        self.seconds += time.perf_counter() - started
+        return answers
+
+
+def _predictor(estimator: PoseEstimator, config: TrackConfig) -> Predictor:
+    if config.runtime == "torch":
+        return estimator.predictor
+    from posekit.nets.openvino import OpenVinoPredictor
+
+    return OpenVinoPredictor(estimator.networks)
+
+
+def _before_camera(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    points[:, 2] = np.maximum(points[:, 2], 1e-3)
+    return points

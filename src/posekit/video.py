@@ -6,9 +6,12 @@ import glob
 import json
 import logging
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
+from queue import Empty, Queue
+from threading import Event, Thread
 from types import TracebackType
 from typing import Any, Protocol
 
@@ -32,13 +35,14 @@ MOST_FAILURES = 100  # frames of a camera or video that may fail one after the o
 class Frame:
     """number: in the source, from 0, or the picture's own in a BOP scene. image: uint8 RGB (H, W, 3), None where it
     could not be decoded, and ``problem`` says why. camera: of this frame, where it is known. seconds: since the start,
-    where known."""
+    where known. scene: of a BOP scene, else 0."""
 
     number: int
     image: Image | None
     camera: Camera | None = None
     seconds: float | None = None
     problem: str = ""
+    scene: int = 0
 
 
 class Frames(Protocol):
@@ -130,6 +134,7 @@ class SceneFrames:
         except (OSError, ValueError) as error:
             raise InputError(f"{folder / 'scene_camera.json'} cannot be read: {error}.") from error
         self.folder, self.count = folder, len(self.cameras)
+        self.scene = int(folder.name) if folder.name.isdigit() else 0
         if not self.count:
             raise InputError(f"{folder / 'scene_camera.json'} names no pictures.")
 
@@ -138,9 +143,9 @@ class SceneFrames:
             try:
                 image = load_image(self._path(number))
                 camera = Camera.from_K(np.reshape(entry["cam_K"], (3, 3)), image.shape[1], image.shape[0])
-                yield Frame(number, image, camera, place / self.rate)
+                yield Frame(number, image, camera, place / self.rate, scene=self.scene)
             except (InputError, KeyError, ValueError) as error:
-                yield Frame(number, None, problem=str(error))
+                yield Frame(number, None, problem=str(error), scene=self.scene)
 
     def _path(self, number: int) -> Path:
         for kind in ("rgb", "gray"):
@@ -238,6 +243,44 @@ class CameraFrames:
                 number += 1
         finally:
             self.capture.release()
+
+
+class LatestFrames:
+    """Always the newest frame of a source that runs beside: what comes while another is worked on is dropped.
+
+    Whoever reads it is at most one frame behind a camera, however slow. For cameras; of a file almost all is dropped.
+    """
+
+    def __init__(self, source: Frames) -> None:
+        self.source, self.rate = source, source.rate
+        self.count: int | None = None
+
+    def __iter__(self) -> Iterator[Frame]:
+        newest: Queue[Frame | BaseException | None] = Queue(1)
+        ended = Event()
+        reader = Thread(target=_keep_newest, args=(self.source, newest, ended), daemon=True)
+        reader.start()
+        try:
+            while (frame := newest.get()) is not None:
+                if isinstance(frame, BaseException):
+                    raise frame
+                yield frame
+        finally:
+            ended.set()
+
+
+def _keep_newest(source: Frames, newest: Queue[Frame | BaseException | None], ended: Event) -> None:
+    try:
+        for frame in source:
+            if ended.is_set():
+                return
+            with suppress(Empty):
+                newest.get_nowait()
+            newest.put(frame)
+    except BaseException as error:  # told to the reader
+        newest.put(error)
+        return
+    newest.put(None)
 
 
 class VideoWriter:

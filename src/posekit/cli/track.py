@@ -22,7 +22,6 @@ from posekit.cli.options import (
     ModelsOption,
     OutOption,
     PresetOption,
-    StopAngleOption,
     SymmetryOption,
     ThreadsOption,
     UnitsOption,
@@ -51,19 +50,34 @@ def track(
     symmetry: SymmetryOption = None,
     preset: PresetOption = "lite",
     weights: WeightsOption = None,
-    iterations: Annotated[int, typer.Option(help="Of a frame at most.", rich_help_panel=LOOP)] = 2,
-    stop_angle: StopAngleOption = 2.0,
+    iterations: Annotated[int, typer.Option(help="Comparisons of a frame at most.", rich_help_panel=LOOP)] = 1,
     restart_angle: Annotated[
         float, typer.Option(metavar="DEGREES", help="Predicted angle that restarts.", rich_help_panel=LOOP)
     ] = 25.0,
-    prior: Annotated[
-        float, typer.Option(min=0, max=1, help="Share of the last motion expected again.", rich_help_panel=LOOP)
-    ] = 0.5,
+    still_angle: Annotated[
+        float,
+        typer.Option(
+            metavar="DEGREES", help="Turn that leaves the pose as it is; the paper's 2.", rich_help_panel=LOOP
+        ),
+    ] = 0.0,
+    motion: Annotated[
+        Literal["points", "velocity", "none"],
+        typer.Option(help="What foretells the next pose: followed points, the last motion.", rich_help_panel=LOOP),
+    ] = "points",
     mask: Annotated[
         Literal["pose", "none"], typer.Option(help="What a frame's mask is taken to be.", rich_help_panel=LOOP)
     ] = "pose",
+    gain: Annotated[
+        float, typer.Option(min=0, max=1, help="Share of the network's update that is made.", rich_help_panel=LOOP)
+    ] = 0.2,
+    runtime: Annotated[
+        Literal["openvino", "torch"], typer.Option(help="Of the network.", rich_help_panel=LOOP)
+    ] = "openvino",
     threads: ThreadsOption = None,
     overlay: Annotated[bool, typer.Option(help="Write overlay.mp4.", rich_help_panel=OUTPUT)] = True,
+    live: Annotated[
+        bool, typer.Option("--live", help="Drop frames to keep up with a camera.", rich_help_panel=OUTPUT)
+    ] = False,
     frames: Annotated[int | None, typer.Option(min=1, help="Frames at most.", rich_help_panel=OUTPUT)] = None,
     out: OutOption = None,
     force: ForceOption = False,
@@ -77,15 +91,19 @@ def track(
     from posekit.estimate import EstimateOptions, PoseEstimator
     from posekit.load import load_pose
     from posekit.object_model import ObjectModel
-    from posekit.track import Tracker, TrackOptions
-    from posekit.video import open_frames
+    from posekit.track import TrackConfig, Tracker
+    from posekit.video import LatestFrames, open_frames
 
     if pose and len(pose) != len(model):
         raise PromptError(f"{len(pose)} --pose for {len(model)} --model: give one for each, in their order, or none.")
-    options = TrackOptions(restart_angle, stop_angle, iterations, prior, mask)
+    config = TrackConfig(
+        restart_angle, still_angle, iterations=iterations, motion=motion, mask=mask, gain=gain, runtime=runtime
+    )
     starts = [load_pose(path) for path in pose] if pose else [None] * len(model)
     meshes = [ObjectModel.load(path, units=units, symmetry=symmetry) for path in model]
-    sequence = open_frames(source, camera)
+    sequence: Frames = open_frames(source, camera)
+    if live:
+        sequence = LatestFrames(sequence)
     finder = None
     if not pose or detector is not None:
         from posekit.cli.prompts import make_detector
@@ -93,7 +111,7 @@ def track(
         finder, _ = make_detector(detector, meshes, threads=threads)
     chosen = EstimateOptions(update="correspondence" if preset == "lite" else "regression")
     trackers = [
-        Tracker(mesh, pose=start, detector=finder, options=options,
+        Tracker(mesh, pose=start, detector=finder, config=config,
                 estimator=PoseEstimator(mesh, preset=preset, weights=weights, options=chosen, threads=threads))
         for mesh, start in zip(meshes, starts, strict=True)
     ]  # fmt: skip
@@ -190,7 +208,7 @@ def _row(frame: Frame, obj_id: int, result: Tracked, seconds: float) -> str:
     pose = result.estimate.T_cam_obj
     R = " ".join(repr(float(v)) for v in pose.R.ravel())
     t = " ".join(repr(float(v) * 1000.0) for v in pose.t)
-    return f"0,{frame.number},{obj_id},{result.estimate.score!r},{R},{t},{seconds!r}"
+    return f"{frame.scene},{frame.number},{obj_id},{result.estimate.score!r},{R},{t},{seconds!r}"
 
 
 def _number(name: str, k: int) -> int:
