@@ -48,8 +48,11 @@ class Frame:
 class Frames(Protocol):
     """Frames one after the other. count: how many there are, where that is known before. rate: frames a second."""
 
-    count: int | None
-    rate: float
+    @property
+    def count(self) -> int | None: ...
+
+    @property
+    def rate(self) -> float: ...
 
     def __iter__(self) -> Iterator[Frame]: ...
 
@@ -219,7 +222,7 @@ def _opened(path: Path) -> Any:
 class CameraFrames:
     """A camera of this machine, live: reading waits for the next frame and older ones are dropped by the driver."""
 
-    count = None
+    count: int | None = None
 
     def __init__(self, index: int, camera: str | Path | None) -> None:
         self._cameras, self.label = _Intrinsics(camera), f"camera {index}"
@@ -295,7 +298,9 @@ class VideoWriter:
         except ImportError as error:
             raise OutputError("writing a video needs PyAV: pip install av.") from error
         self.path, self.part, self.rate = path, path.with_name(f".{path.stem}.part{path.suffix}"), rate
-        self._av, self._container, self._stream = av, None, None
+        self._av = av
+        self._container: Any = None
+        self._stream: Any = None
 
     def __enter__(self) -> VideoWriter:
         return self
@@ -305,7 +310,6 @@ class VideoWriter:
         if self._stream is None:
             self._begin(image)
         stream, container = self._stream, self._container
-        assert stream is not None and container is not None
         if image.shape[:2] != (stream.height, stream.width):
             image = cv2.resize(image, (stream.width, stream.height), interpolation=cv2.INTER_AREA)
         frame = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
@@ -325,6 +329,6 @@ class VideoWriter:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
         if self._container is None:
             return
-        self._container.mux(self._stream.encode())  # type: ignore[attr-defined]
+        self._container.mux(self._stream.encode())
         self._container.close()
         self.part.replace(self.path)  # what was tracked before an interruption is kept

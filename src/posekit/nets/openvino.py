@@ -95,7 +95,7 @@ def _convert(svnet: LiteSVNet) -> Any:
     example = (pair, pair, torch.zeros(1, height // 4, width // 4), torch.ones(1))
     with torch.inference_mode(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of sizes that become constants: a crop's size is one
-        traced = torch.jit.trace(_Answers(svnet).eval(), example, check_trace=False)  # type: ignore[no-untyped-call]
+        traced = torch.jit.trace(_Answers(svnet).eval(), example, check_trace=False)
     return openvino.convert_model(traced, example_input=example, input=[list(x.shape) for x in example])
 
 

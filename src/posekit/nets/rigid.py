@@ -101,7 +101,7 @@ def solved(A: Tensor, g: Tensor) -> Tensor:
 
     While the network is traced for another runtime: Gauss-Jordan without pivots, in operations that each of them has.
     """
-    if not torch.jit.is_tracing():  # type: ignore[no-untyped-call]
+    if not torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]
         return torch.linalg.solve(A, g[..., None])[..., 0]
     N = A.shape[1]
     M, eye = torch.cat([A, g[..., None]], dim=2), torch.eye(N)
