@@ -79,9 +79,15 @@ def row(found: Tracked, truth: Instance | None, model: ObjectModel) -> dict[str,
     if found.estimate is not None:
         pose = found.estimate.T_cam_obj
         turn, shift = pose_error(pose, truth.T_cam_obj, model.symmetries.transforms()) if truth else (np.inf, np.inf)
-        entry |= {"pose": pose, "re": float(np.rad2deg(turn)), "te": float(shift), "score": found.estimate.score,
-                  "angle": float(np.rad2deg(found.estimate.angle)),
-                  "network": found.estimate.timings.get("network")}  # fmt: skip
+        entry |= {
+            "pose": pose,
+            "truth": truth and truth.T_cam_obj,
+            "re": float(np.rad2deg(turn)),
+            "te": float(shift),
+            "score": found.estimate.score,
+            "angle": float(np.rad2deg(found.estimate.angle)),
+            "network": found.estimate.timings.get("network"),
+        }
     return entry
 
 

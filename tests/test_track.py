@@ -21,7 +21,7 @@ from posekit.errors import CameraError, ConfigError
 from posekit.geometry import Pose, rotation_angle, so3_exp, view_rotation
 from posekit.metrics import pose_error
 from posekit.object_model import ObjectModel
-from posekit.odometry import follow_points
+from posekit.odometry import follow_points, look
 from posekit.render import Renderer
 from posekit.results import Detection, Estimate
 from posekit.track import LOST, RESTARTED, TRACKED, TrackConfig, Tracker
@@ -30,7 +30,7 @@ from posekit.view import View
 from test_refine import Oracle
 
 CAMERA = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
-STEADY = TrackConfig(gain=1.0)
+STEADY = TrackConfig(gain=1.0, still_deg=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -102,19 +102,19 @@ def test_an_oracle_is_followed(model: ObjectModel, renderer: Renderer, motion: s
 
 def test_followed_points_alone_carry_a_pose(model: ObjectModel, renderer: Renderer) -> None:
     before, after = (photograph(renderer, model, path(model, k)) for k in (0, 1))
-    found = follow_points(before, after, path(model, 0), model, renderer)
+    found = follow_points(look(before, path(model, 0), model, renderer), after, model)
     assert found.pose is not None and found.share > 0.3
     still = pose_error(path(model, 0), path(model, 1))
     moved = pose_error(found.pose, path(model, 1))
     assert moved[0] < 0.35 * still[0] and moved[1] < 0.35 * still[1]
     flat = View(np.full_like(after.image, 128), CAMERA)
-    assert follow_points(flat, flat, path(model, 0), model, renderer).pose is None
+    assert follow_points(look(flat, path(model, 0), model, renderer), flat, model).pose is None
 
 
 def test_the_gain_is_the_share_of_the_update(model: ObjectModel, renderer: Renderer) -> None:
     turns = []
     for gain in (0.0, 0.5, 1.0):
-        config = TrackConfig(gain=gain, motion="none")
+        config = TrackConfig(gain=gain, still_deg=0.0, motion="none")
         following = tracker(model, renderer, path(model, 2), config, pose=path(model, 0))
         found = following.step(photograph(renderer, model, path(model, 2)).image).T_cam_obj
         assert found is not None
@@ -124,7 +124,7 @@ def test_the_gain_is_the_share_of_the_update(model: ObjectModel, renderer: Rende
     np.testing.assert_allclose(turns, [0, 0.5, 1], atol=0.02)
 
 
-def test_a_small_turn_leaves_the_pose_where_asked(model: ObjectModel, renderer: Renderer) -> None:
+def test_a_small_predicted_angle_leaves_the_pose_where_asked(model: ObjectModel, renderer: Renderer) -> None:
     config = replace(STEADY, motion="none", still_deg=5.0)
     following = tracker(model, renderer, path(model, 1), config, pose=path(model, 0))
     found = following.step(photograph(renderer, model, path(model, 1)).image)
@@ -261,7 +261,7 @@ def test_a_video_becomes_poses_and_an_overlay(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     c = example.view.camera
     (folder / "camera.txt").write_text(f"{c.fx},{c.fy},{c.cx},{c.cy}")
-    done = run(folder, "--pose", folder / "pose.json", "--out", tmp_path / "out", "--gain", 1)
+    done = run(folder, "--pose", folder / "pose.json", "--out", tmp_path / "out", "--gain", 1, "--still-angle", 0)
     assert done.exit_code == 0, done.output
     assert "5 tracked" in done.stdout
     lines = [json.loads(line) for line in (tmp_path / "out" / "poses.jsonl").read_text().splitlines()]

@@ -20,10 +20,9 @@ from posekit.camera import Camera
 from posekit.errors import CameraError, ConfigError
 from posekit.estimate import PoseEstimator
 from posekit.geometry import Pose, rotation_angle, so3_exp, so3_log
-from posekit.hypotheses import agreements
 from posekit.nets.predictor import PairPrediction, Predictor
 from posekit.object_model import ObjectModel
-from posekit.odometry import follow_points
+from posekit.odometry import Look, colours, follow_points, look
 from posekit.refine import compare, predicted_angle, update_pose
 from posekit.results import Detection, Estimate
 from posekit.view import View
@@ -41,24 +40,26 @@ class Finder(Protocol):
 
 @dataclass(frozen=True)
 class TrackConfig:
-    """restart_deg: predicted angle that restarts. still_deg: turn below which the comparison leaves the pose as it is,
-    both degrees. iterations: comparisons of a frame at most; a second one follows a turn of more than ``again_deg``.
+    """restart_deg, still_deg: predicted angles that restart, and that leave the pose where the comparison started, both
+    degrees. iterations: comparisons of a frame at most; a second one follows a turn of more than ``again_deg``.
     motion: where a frame's comparison starts: where followed points lead ("points"), the share ``prior`` of the last
     motion once more ("velocity"), or the last pose ("none"). mask: what a frame's mask is taken to be, the silhouette
     where the comparison starts ("pose") or nothing ("none"). gain: share of the comparison's update that is made.
-    least_colour: correlation of colours with the mesh's below which a pose is in doubt. least_inside: share of the
-    silhouette's box in the picture, likewise. doubts: frames in a row after which the object is lost. search: frames
-    between two attempts to find it. first: least score of a first pose. runtime: of the network."""
+    alike: likeness of the colours inside the silhouette to what they were (overlap of their histograms), below which a
+    pose is in doubt. learn: share of a frame in what they were. least_inside: share of the silhouette's box in the
+    picture, likewise. doubts: frames in a row after which the object is lost. search: frames between two attempts to
+    find it. first: least score of a first pose. runtime: of the network."""
 
     restart_deg: float = 25.0
-    still_deg: float = 0.0
+    still_deg: float = 2.0
     again_deg: float = 8.0
     iterations: int = 1
     motion: str = "points"
     prior: float = 0.7
     mask: str = "pose"
-    gain: float = 0.2
-    least_colour: float = 0.1
+    gain: float = 1.0
+    alike: float = 0.65
+    learn: float = 0.02
     least_inside: float = 0.3
     doubts: int = 3
     search: int = 5
@@ -83,7 +84,7 @@ class TrackConfig:
 @dataclass(frozen=True, eq=False)
 class Tracked:
     """What a frame says about the object. state: "tracked", "restarted" (a new first pose) or "lost". estimate: None
-    where it is lost; its score is the confidence, the correlation of colours with the mesh's."""
+    where it is lost; its score is the confidence, the likeness of its colours to what they were."""
 
     state: str
     estimate: Estimate | None = None
@@ -128,7 +129,8 @@ class Tracker:
         self._outline = model.outline - model.center
         self._pose = pose
         self._motion = Pose.identity()  # of the object's centre and axes, from the frame before the last to the last
-        self._before: View | None = None
+        self._before: Look | None = None
+        self._colours: NDArray[np.float32] | None = None  # of the object, as it was seen
         self._doubts = 0
         self._waiting = 0  # frames until the next search
 
@@ -141,18 +143,24 @@ class Tracker:
         last, found = self._pose, None
         if last is not None:
             found = self._follow(view, last)
-            if found is None or math.degrees(found.angle) > self.config.restart_deg or self._lost_sight(view, found):
+            if (
+                found is None
+                or math.degrees(found[0].angle) > self.config.restart_deg
+                or self._lost_sight(view, found[0])
+            ):
                 self._lose()
         if self._pose is None:
             return self._find(view)
         assert last is not None and found is not None
-        self._motion = self._moved(last, found.T_cam_obj)
-        self._pose, self._before = found.T_cam_obj, view
-        return Tracked(TRACKED, found)
+        estimate, self._before = found
+        self._motion, self._pose = self._moved(last, estimate.T_cam_obj), estimate.T_cam_obj
+        if not self._doubts:
+            self._learn(self._before, self.config.learn)
+        return Tracked(TRACKED, estimate)
 
     # --- following ---
 
-    def _follow(self, view: View, last: Pose) -> Estimate | None:
+    def _follow(self, view: View, last: Pose) -> tuple[Estimate, Look] | None:
         """From where the object is expected; None where it cannot be compared."""
         started = time.perf_counter()
         pose, angle, network = self._expected(view, last), 0.0, 0.0
@@ -164,16 +172,18 @@ class Tracker:
             if updated is None:
                 return None
             turn = math.degrees(rotation_angle(updated.R @ pose.R.T))
-            if turn >= self.config.still_deg:
+            if math.degrees(angle) >= self.config.still_deg:
                 pose = self._between(pose, updated)
             if turn < self.config.again_deg or k + 1 == self.config.iterations:
                 break
         if not self._in_front(pose):
             return None
-        [seen] = agreements(view, self.model, [pose], self.renderer, self.predictor.size)
+        at = look(view, pose, self.model, self.renderer)
+        now = colours(at)
+        likeness = float(np.minimum(now, now if self._colours is None else self._colours).sum())
         timings = {"network": network, "total": time.perf_counter() - started}
         box = view.camera.points_box(_before_camera(pose.apply(self.model.outline)))
-        return Estimate(pose, angle, k + 1, True, max(0.0, seen.colour), box, self.model.name, timings=timings)
+        return Estimate(pose, angle, k + 1, True, likeness, box, self.model.name, timings=timings), at
 
     def _compared(self, view: View, pose: Pose) -> tuple[Pose | None, float, float]:
         """The pose after one prediction, the predicted angle, and the seconds that the network took."""
@@ -186,9 +196,9 @@ class Tracker:
     def _expected(self, view: View, last: Pose) -> Pose:
         """Where the object should be in this frame, by ``config.motion``."""
         if self.config.motion == "points":
-            if self._before is None or self._before.camera.size != view.camera.size:
+            if self._before is None or self._before.size != view.camera.size:
                 return last
-            return follow_points(self._before, view, last, self.model, self.renderer).pose or last
+            return follow_points(self._before, view, self.model).pose or last
         share = self.config.prior if self.config.motion == "velocity" else 0.0
         centred = last @ self.model.T_obj_ctr
         R = so3_exp(so3_log(self._motion.R) * share) @ centred.R
@@ -215,12 +225,18 @@ class Tracker:
         width, height = view.camera.size
         inside = max(0.0, min(x1, width) - max(x0, 0.0)) * max(0.0, min(y1, height) - max(y0, 0.0))
         share = inside / max((x1 - x0) * (y1 - y0), 1e-9)
-        doubted = share < self.config.least_inside or found.score < self.config.least_colour
+        doubted = share < self.config.least_inside or found.score < self.config.alike
         self._doubts = self._doubts + 1 if doubted else 0
         return share == 0 or self._doubts >= self.config.doubts
 
+    def _learn(self, at: Look, share: float) -> None:
+        """What the object's colours are, from what they were and from this frame."""
+        now = colours(at)
+        self._colours = now if self._colours is None else (1 - share) * self._colours + share * now
+
     def _lose(self) -> None:
         self._pose, self._before, self._motion = None, None, Pose.identity()
+        self._colours = None
         self._doubts = self._waiting = 0
 
     def _find(self, view: View) -> Tracked:
@@ -233,7 +249,9 @@ class Tracker:
         found = max(self.estimator.estimate(view, detections), key=lambda e: e.score, default=None)
         if found is None or found.score < self.config.first:
             return Tracked(LOST)
-        self._pose, self._before, self._waiting = found.T_cam_obj, view, 0
+        self._pose, self._waiting = found.T_cam_obj, 0
+        self._before = look(view, found.T_cam_obj, self.model, self.renderer)
+        self._learn(self._before, 1.0)
         return Tracked(RESTARTED, found)
 
 

@@ -56,10 +56,8 @@ def track(
     ] = 25.0,
     still_angle: Annotated[
         float,
-        typer.Option(
-            metavar="DEGREES", help="Turn that leaves the pose as it is; the paper's 2.", rich_help_panel=LOOP
-        ),
-    ] = 0.0,
+        typer.Option(metavar="DEGREES", help="Predicted angle that leaves the pose as it is.", rich_help_panel=LOOP),
+    ] = 2.0,
     motion: Annotated[
         Literal["points", "velocity", "none"],
         typer.Option(help="What foretells the next pose: followed points, the last motion.", rich_help_panel=LOOP),
@@ -69,7 +67,7 @@ def track(
     ] = "pose",
     gain: Annotated[
         float, typer.Option(min=0, max=1, help="Share of the network's update that is made.", rich_help_panel=LOOP)
-    ] = 0.2,
+    ] = 1.0,
     runtime: Annotated[
         Literal["openvino", "torch"], typer.Option(help="Of the network.", rich_help_panel=LOOP)
     ] = "openvino",
