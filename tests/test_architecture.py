@@ -24,7 +24,7 @@ LAYERS = {
     7: {"__main__"},
 }
 ANYWHERE = {"errors", "_version"}
-SIBLINGS = {("camera", "geometry")}  # a camera turns rays
+SIBLINGS = {("camera", "geometry"), ("evaluate", "track")}  # a camera turns rays; tracking is measured too
 
 # A foreign library and the rooms whose door it is.
 DOORS = {

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from bop_scene import write_scene
 from objects import bracket
 from posekit.camera import Camera
 from posekit.cli.app import app
@@ -292,3 +293,32 @@ def test_nothing_to_track_is_an_error(folder: Path, tmp_path: Path) -> None:
     assert result.exit_code == 1 and "2 --pose for 1 --model" in result.stderr
     result = run(folder, *flags, "--out", tmp_path / "c", source="none.mp4")
     assert result.exit_code == 1 and "there is no" in result.stderr
+
+
+# --- eval --stage track ---------------------------------------------------------------------------------------------
+
+
+def still_scene(root: Path) -> Path:
+    """The first picture of a small scene five times over."""
+    write_scene(root, images=1)
+    folder = root / "test" / "000002"
+    for name in ("scene_gt", "scene_gt_info", "scene_camera"):
+        entries = json.loads((folder / f"{name}.json").read_text())
+        (folder / f"{name}.json").write_text(json.dumps({str(k): entries["0"] for k in range(5)}))
+    for file in [*folder.glob("*/000000.png"), *folder.glob("*/000000_*.png")]:
+        for k in range(1, 5):
+            (file.parent / file.name.replace("000000", f"{k:06d}", 1)).write_bytes(file.read_bytes())
+    return root
+
+
+def test_eval_follows_a_sequence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    root = still_scene(tmp_path / "still")
+    command = ["eval", "--stage", "track", "--root", str(root), "--min-visible", "0.5", "--out", str(tmp_path / "out")]
+    assert CliRunner().invoke(app, command).exit_code == 0
+    results = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert results["stage"] == "track" and results["counts"]["instances"] == 10
+    states = [i["state"] for i in results["instances"] if i["found"]]
+    assert len(states) >= 5 and set(states) <= {"tracked", "restarted"}
+    done = CliRunner().invoke(app, [*command[:-1], str(tmp_path / "b"), "--images", "3"])
+    assert done.exit_code == 1 and "whole sequences" in done.stderr
