@@ -17,14 +17,14 @@ LAYERS = {
     0: {"geometry", "camera", "files"},
     1: {"view", "object_model", "results"},
     2: {"load", "zoom", "metrics", "pnp", "render", "nets", "detect", "draw"},
-    3: {"data", "refine", "hypotheses", "figures"},
+    3: {"data", "refine", "hypotheses", "figures", "odometry", "video"},
     4: {"estimate", "novel"},
     5: {"search", "track", "evaluate", "train"},
     6: {"cli"},
     7: {"__main__"},
 }
 ANYWHERE = {"errors", "_version"}
-SIBLINGS = {("camera", "geometry")}  # a camera turns rays
+SIBLINGS = {("camera", "geometry"), ("evaluate", "track")}  # a camera turns rays; tracking is measured too
 
 # A foreign library and the rooms whose door it is.
 DOORS = {
@@ -37,6 +37,8 @@ DOORS = {
     "rich": {"cli"},
     "huggingface_hub": {"data"},
     "pycocotools": {"detect"},
+    "av": {"video"},
+    "openvino": {"nets", "cli"},
 }
 
 ROOM_LAYER = {room: layer for layer, rooms in LAYERS.items() for room in rooms}

@@ -66,6 +66,16 @@ def test_augmentation_keeps_the_truth(pairs: list[Pair]) -> None:
         assert not (sample.visible & ~pair.seen).any(), "nothing becomes visible"
 
 
+def test_a_mask_can_be_the_last_poses(pairs: list[Pair]) -> None:
+    plain = AugmentConfig(0, 0, 0, 1.0, 1, 0, 0, 0, source_mask=1.0)
+    overlaps = []
+    for k, pair in enumerate(pairs):
+        mask = augment(pair, [], [], plain, np.random.default_rng(k)).observed[..., 3] > 0
+        known = pair.source[..., 3] > 0
+        overlaps.append((mask & known).sum() / max(1, (mask | known).sum()))
+    assert np.median(overlaps) > 0.9
+
+
 def test_without_augmentation_the_object_stays_where_it_is(pairs: list[Pair]) -> None:
     config = AugmentConfig(clutter=0, occluded=0, shrink=1, dilate=0, no_mask=0, box_mask=0, cut_mask=0)
     rng = np.random.default_rng(6)

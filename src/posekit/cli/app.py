@@ -15,7 +15,7 @@ import typer
 from typer.core import TyperGroup
 
 from posekit._version import __version__
-from posekit.cli import demo, detect, doctor, download, estimate, eval, refine, render_views, synth, train
+from posekit.cli import demo, detect, doctor, download, estimate, eval, refine, render_views, synth, track, train
 from posekit.errors import PosekitError
 
 INTERRUPTED = 130  # as shells count it: 128 + SIGINT
@@ -96,6 +96,7 @@ def _options(
 app.command("estimate")(estimate.estimate)
 app.command("detect")(detect.detect)
 app.command("refine")(refine.refine)
+app.command("track")(track.track)
 app.command("render-views")(render_views.render_views)
 app.command("synth")(synth.synth)
 app.add_typer(train.train, name="train")

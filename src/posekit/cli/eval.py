@@ -31,8 +31,10 @@ DATA, STAGE = "Data", "Stage"
 
 def evaluate(
     stage: Annotated[
-        Literal["refine", "estimate", "score"],
-        typer.Option(help="From disturbed truth; from detections; or only score a CSV.", rich_help_panel=STAGE),
+        Literal["refine", "estimate", "track", "score"],
+        typer.Option(
+            help="From disturbed truth; from detections; through sequences; or only score a CSV.", rich_help_panel=STAGE
+        ),
     ] = "estimate",
     dataset: Annotated[
         str | None, typer.Option(metavar="NAME", help="lmo, lm, linemod, ycbv, tless, ...", rich_help_panel=DATA)

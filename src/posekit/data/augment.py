@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -24,7 +24,8 @@ class AugmentConfig:
     occluded: share with something in front. shrink: the observed crop is shrunk by up to this factor and
     re-enlarged, since real objects are small in their photographs. dilate: largest dilation of the mask (the
     paper's 40 px at 640x480). no_mask, box_mask, cut_mask: shares of masks left out, replaced by the filled
-    box, and cut in part.
+    box, and cut in part. source_mask: share of pairs whose mask is the source's, as in a video, where the last
+    frame's pose is all that is known of the next one's mask.
     """
 
     photo: float = 0.6
@@ -35,6 +36,7 @@ class AugmentConfig:
     no_mask: float = 0.15
     box_mask: float = 0.12
     cut_mask: float = 0.08
+    source_mask: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +53,9 @@ def augment(pair: Pair, others: Sequence[Pair], photos: Sequence[Image], config:
     """Put the target before a background and behind occluders, photograph it badly, and blur what is known of
     its mask. others: pairs to take clutter and occluders from."""
     observed, hidden = observe(pair.target, [other.target for other in others], photos, config, rng)
+    if config.source_mask and rng.random() < config.source_mask:
+        known = disturb_mask(pair.source[..., 3] > 0, replace(config, no_mask=0.0), rng)
+        observed[..., 3] = known.astype(np.uint8) * 255
     visible = pair.seen & ~_at_anchors(hidden, pair)
     return Sample(observed, pair.source, pair, visible)
 

@@ -11,7 +11,7 @@ from posekit.errors import ConfigError
 from posekit.estimate import EstimateOptions
 from posekit.geometry import PoseNoise
 
-STAGES = ("refine", "estimate", "score")
+STAGES = ("refine", "estimate", "track", "score")
 DETECTIONS = ("gt-boxes", "gt-masks")
 MASKS = ("true", "none")
 NOT_RESULTS = ("workers",)  # what may differ between two runs of the same results
@@ -45,6 +45,8 @@ class EvalOptions:
     def __post_init__(self) -> None:
         if self.stage not in STAGES:
             raise ConfigError(f"the stage is one of {', '.join(STAGES)}, not {self.stage!r}.")
+        if self.stage == "track" and (self.workers > 1 or self.limit is not None):
+            raise ConfigError("tracking needs whole sequences in order: leave --workers and a number of --images out.")
         if self.min_visible is not None and not 0 <= self.min_visible <= 1:
             raise ConfigError(f"the least visible share is between 0 and 1, not {self.min_visible:g}.")
         if self.masks not in MASKS:

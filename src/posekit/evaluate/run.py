@@ -119,6 +119,8 @@ def _records(
 ) -> list[Record]:
     """All records, the missing ones computed."""
     left = [picture for picture in wanted if not folder.has(picture)]
+    if options.stage == "track" and left:
+        left = list(wanted)  # a sequence cannot be begun in its middle
     done = len(wanted) - len(left)
     if done and left:
         log.info("going on after %d of %d pictures", done, len(wanted))
@@ -148,7 +150,7 @@ def _from_records(data: Dataset, records: Sequence[Record]) -> tuple[list[Case],
     cases: list[Case] = []
     guesses: list[Guess] = []
     sources: dict[str, int] = {}
-    kept = ("seconds", "angle_deg", "iterations", "converged", "trace", "start", "detection_score")
+    kept = ("seconds", "angle_deg", "iterations", "converged", "trace", "start", "detection_score", "state")
     for record in records:
         scene, image = record["scene"], record["image"]
         cases += _cases(data, scene, image, record["truths"])

@@ -22,6 +22,7 @@ from posekit.errors import ConfigError, PromptError
 from posekit.estimate import PoseEstimator
 from posekit.evaluate.bop_results import FoundRegion, read_detections
 from posekit.evaluate.options import DETECTIONS, EvalOptions
+from posekit.evaluate.tracking import Sequences
 from posekit.evaluate.truths import Truth, TruthReader, selected
 from posekit.geometry import Pose
 from posekit.metrics import box_iou
@@ -40,6 +41,7 @@ class ImageStage:
         self.data, self.info = open_dataset(options.dataset, options.root, options.split)
         self.truths = TruthReader(self.data)
         self._estimators: dict[int, PoseEstimator] = {}
+        self._sequences = Sequences(self._estimator, "openvino" if options.preset == "lite" else "torch")
         self._files: Mapping[tuple[int, int], Sequence[FoundRegion]] = {}
         if options.stage == "estimate" and options.detections not in DETECTIONS:
             self._files = detections_for(self.data, options)
@@ -49,7 +51,8 @@ class ImageStage:
         truths = self.truths.read(scene, image)
         chosen = selected(self.data, truths, scene, image, self.options)
         record: Record = {"scene": scene, "image": image, "truths": [_truth(t, chosen) for t in truths]}
-        view = self.data.view(scene, image) if chosen or (scene, image) in self._files else None
+        wanted = chosen or (scene, image) in self._files or self.options.stage == "track"
+        view = self.data.view(scene, image) if wanted else None
         record["estimates"] = [] if view is None else self._estimates(view, truths, chosen)
         if self._files:
             record["detections"] = overlaps(self._files.get((scene, image), ()), truths)
@@ -58,11 +61,21 @@ class ImageStage:
     def _estimates(self, view: View, truths: list[Truth], chosen: list[Truth]) -> list[Record]:
         if self.options.stage == "refine":
             return [self._refined(view, truth) for truth in chosen]
+        if self.options.stage == "track":
+            return self._tracked(view, truths, chosen)
         if self.options.detections in DETECTIONS:
             found = [self._from_truth(view, truth) for truth in chosen]
             return [entry for entry in found if entry is not None]
         scene, image = truths[0].instance.scene, truths[0].instance.image
         return self._from_file(view, self._files.get((scene, image), ()))
+
+    def _tracked(self, view: View, truths: list[Truth], chosen: list[Truth]) -> list[Record]:
+        """Of every object that is not lost, with its state."""
+        if not truths:
+            return []
+        found = self._sequences.step(truths[0].instance.scene, view, truths, chosen)
+        entries = [(each.state, _entry(each.estimate, obj_id, index)) for each, obj_id, index in found if each.estimate]
+        return [entry | {"state": state} for state, entry in entries]
 
     def _refined(self, view: View, truth: Truth) -> Record:
         instance, estimator = truth.instance, self._estimator(truth.instance.obj_id)

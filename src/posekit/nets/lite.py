@@ -225,7 +225,7 @@ class LiteSVNet(nn.Module):
         weight = on * torch.sigmoid(dense[:, 3]) * torch.exp(-2 * log_scale)
         surface = Surface.of(relief, focal, ANCHOR, 2.0)
         motion = solve_motion(surface, points_of(fine_flow), weight.flatten(1))
-        rigid = [first_motion, induced_flow(surface, motion).mT.unflatten(2, on.shape[1:])]
+        rigid = [first_motion, induced_flow(surface, motion).transpose(1, 2).unflatten(2, on.shape[1:])]
         masks = F.avg_pool2d(torch.cat([observed[:, 3:], rendered[:, 3:]], dim=1), CELL)
         known = [cells, (better.detach() / CELL).to(cells.dtype), masks.to(cells.dtype)]
         facts = facts_of(motion, on, log_scale, dense[:, 3]).detach()
@@ -240,7 +240,7 @@ class LiteSVNet(nn.Module):
         mean = F.avg_pool2d((relief * on)[:, None], 2)[:, 0] / share.clamp_min(0.25)
         weight = share * torch.exp(log_weight.clamp(-6.0, 6.0))
         motion = solve_motion(Surface.of(mean, focal, CELL, 3.5), points_of(flow), weight.flatten(1))
-        return induced_flow(Surface.of(relief, focal, ANCHOR, 2.0), motion).mT.unflatten(2, on.shape[1:])
+        return induced_flow(Surface.of(relief, focal, ANCHOR, 2.0), motion).transpose(1, 2).unflatten(2, on.shape[1:])
 
 
 def facts_of(motion: Motion, on: Tensor, log_scale: Tensor, visibility: Tensor) -> Tensor:
@@ -248,7 +248,7 @@ def facts_of(motion: Motion, on: Tensor, log_scale: Tensor, visibility: Tensor) 
     and shift, and over the object the mean log scale and visibility."""
     R, t = motion.R, motion.t
     turn = torch.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], dim=1)
-    cosine = 0.5 * (R.diagonal(dim1=1, dim2=2).sum(1, keepdim=True) - 1)
+    cosine = 0.5 * ((R * torch.eye(3, device=R.device)).sum((1, 2))[:, None] - 1)
     share = on / on.sum((1, 2), keepdim=True).clamp_min(1.0)
     means = [(x * share).sum((1, 2))[:, None] for x in (log_scale, torch.sigmoid(visibility))]
     return torch.cat([turn, 4 * (1 - cosine), (10 * t).clamp(-3, 3), *means], dim=1)
@@ -256,7 +256,7 @@ def facts_of(motion: Motion, on: Tensor, log_scale: Tensor, visibility: Tensor) 
 
 def points_of(flow: Tensor) -> Tensor:
     """(B, 2, h, w) -> (B, h * w, 2)."""
-    return flow.flatten(2).mT
+    return flow.flatten(2).transpose(1, 2)
 
 
 def soft_flow(likeness: Tensor, cells: tuple[int, int]) -> tuple[Tensor, Tensor]:

@@ -91,9 +91,23 @@ def _step(surface: Surface, motion: Motion, flow: Tensor, weight: Tensor) -> Mot
     weighted = J * share[..., None, None]
     A = torch.einsum("bnki,bnkj->bij", weighted, J)
     g = torch.einsum("bnki,bnk->bi", weighted, residual)
-    A = A + torch.diag_embed(DAMPING * A.diagonal(dim1=1, dim2=2) + 1e-6)
-    delta = torch.linalg.solve(A, g[..., None])[..., 0]
+    eye = torch.eye(6, device=A.device)
+    delta = solved(A + eye * (DAMPING * A + 1e-6), g)
     return Motion(exp_so3(delta[:, :3]) @ motion.R, motion.t + delta[:, 3:])
+
+
+def solved(A: Tensor, g: Tensor) -> Tensor:
+    """x with A x = g; A (B, N, N) positive definite, g (B, N).
+
+    While the network is traced for another runtime: Gauss-Jordan without pivots, in operations that each of them has.
+    """
+    if not torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]
+        return torch.linalg.solve(A, g[..., None])[..., 0]
+    N = A.shape[1]
+    M, eye = torch.cat([A, g[..., None]], dim=2), torch.eye(N)
+    for k in range(N):
+        M = M - (M[:, :, k : k + 1] - eye[:, k : k + 1]) * (M[:, k : k + 1] / M[:, k : k + 1, k : k + 1])
+    return M[:, :, N]
 
 
 def exp_so3(w: Tensor) -> Tensor:

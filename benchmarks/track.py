@@ -1,0 +1,189 @@
+"""Tracking on sequences with known truth: speed from the video's bytes to the pose, and how good the poses are.
+
+    python benchmarks/track.py DIR [DIR ...] [--weights FILE] [--frames N] [--set KEY=VALUE ...] [--json FILE]
+
+DIR is a data set in BOP layout made by `posekit synth --kind sequence`. Every scene becomes a video, and every object
+in it is followed alone from its true first pose; when it is lost, its true mask, where a tenth of it is seen, stands
+for the detector. Prints for each object
+
+- fps, and cpu: frames per second of wall and of processor time, reading the video included, the first frame and
+  searches not; outside: the share of time that is spent outside the network;
+- 5,5: the share of frames in which a tenth of the object is seen and that are within 5 degrees and 5 cm;
+- false: the longest run of frames called tracked while nothing of the object is seen;
+- back: the most frames from its return (half of it is seen) until it is followed within 5 degrees and 5 cm;
+- jitter: median turn (degrees) and shift (mm) from frame to frame beyond the true one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import itertools
+import json
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from posekit.camera import mask_box
+from posekit.data.bop import BopDataset, Instance
+from posekit.estimate import PoseEstimator
+from posekit.geometry import Pose, rotation_angle
+from posekit.metrics import pose_error
+from posekit.object_model import ObjectModel
+from posekit.results import Detection
+from posekit.track import LOST, RESTARTED, TrackConfig, Tracked, Tracker
+from posekit.video import SceneFrames, VideoFrames, VideoWriter
+from posekit.view import View
+
+SEEN, HALF = 0.1, 0.5
+
+
+class TrueMasks:
+    """Stands for a detector: finds what is there."""
+
+    instance: Instance | None = None
+
+    def detect(self, _: View, models: Sequence[ObjectModel]) -> list[Detection]:
+        if self.instance is None or self.instance.visib_fract < SEEN:
+            return []
+        mask = self.instance.mask()
+        box = mask_box(mask)
+        return [] if box is None else [Detection(box, mask, 1.0, models[0].name, "mask")]
+
+
+def follow(data: BopDataset, scene: int, images: list[int], obj_id: int, video: Path, tracker: Tracker,
+           detector: TrueMasks) -> list[dict[str, Any]]:  # fmt: skip
+    """What was said of each frame, with its errors and seconds."""
+    model, rows = tracker.model, []
+    frames = iter(VideoFrames(video, None))
+    for image in images:
+        truth = next((i for i in data.instances(scene, image, every=True) if i.obj_id == obj_id), None)
+        detector.instance, camera = truth, data.view(scene, image).camera
+        started, cpu = time.perf_counter(), time.process_time()
+        frame = next(frames)
+        assert frame.image is not None
+        found = tracker.step(frame.image, camera)
+        wall, cpu = time.perf_counter() - started, time.process_time() - cpu
+        rows.append(
+            row(found, truth, model) | {"scene": scene, "obj": obj_id, "image": image, "wall": wall, "cpu": cpu}
+        )
+    return rows
+
+
+def row(found: Tracked, truth: Instance | None, model: ObjectModel) -> dict[str, Any]:
+    entry: dict[str, Any] = {"state": found.state, "visible": truth.visib_fract if truth else 0.0}
+    if found.estimate is not None:
+        pose = found.estimate.T_cam_obj
+        turn, shift = pose_error(pose, truth.T_cam_obj, model.symmetries.transforms()) if truth else (np.inf, np.inf)
+        entry |= {
+            "pose": pose,
+            "truth": truth and truth.T_cam_obj,
+            "re": float(np.rad2deg(turn)),
+            "te": float(shift),
+            "score": found.estimate.score,
+            "angle": float(np.rad2deg(found.estimate.angle)),
+            "network": found.estimate.timings.get("network"),
+        }
+    return entry
+
+
+def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    good = [r["state"] != LOST and r["re"] < 5 and r["te"] < 0.05 for r in rows]
+    seen = [g for g, r in zip(good, rows, strict=True) if r["visible"] >= SEEN]
+    timed = [r for r in rows[1:] if r.get("network")]
+    wall = sum(r["wall"] for r in timed)
+    result = {
+        "frames": len(rows),
+        "fps": len(timed) / wall if wall else 0.0,
+        "cpu": len(timed) / max(sum(r["cpu"] for r in timed), 1e-9),
+        "outside": 1 - sum(r["network"] for r in timed) / wall if wall else 0.0,
+        "5,5": 100 * float(np.mean(seen)) if seen else 0.0,
+        "lost": sum(r["state"] == LOST for r in rows),
+        "restarted": sum(r["state"] == RESTARTED for r in rows),
+        "false": longest([r["visible"] == 0 and r["state"] != LOST for r in rows]),
+        "back": recovery(rows, good),
+    }
+    return result | dict(zip(("jitter_deg", "jitter_mm"), jitter(rows), strict=True))
+
+
+def longest(flags: Sequence[bool]) -> int:
+    best = run = 0
+    for flag in flags:
+        run = run + 1 if flag else 0
+        best = max(best, run)
+    return best
+
+
+def recovery(rows: list[dict[str, Any]], good: list[bool]) -> int | None:
+    """Frames from each return until the object is followed, the most of all; None where it never left."""
+    worst, gone, since = None, False, None
+    for k, r in enumerate(rows):
+        gone = gone or r["visible"] == 0
+        if gone and r["visible"] >= HALF:
+            gone, since = False, k
+        if since is not None and (good[k] or k == len(rows) - 1):
+            worst, since = max(worst or 0, k - since), None
+    return worst
+
+
+def jitter(rows: list[dict[str, Any]]) -> tuple[float | None, float | None]:
+    turns, shifts = [], []
+    for a, b in itertools.pairwise(rows):
+        if a.get("truth") and b.get("truth") and b["state"] != RESTARTED:
+            true = b["truth"] @ a["truth"].inverse()
+            off: Pose = (b["pose"] @ a["pose"].inverse()) @ true.inverse()
+            turns.append(np.rad2deg(rotation_angle(off.R)))
+            shifts.append(1000 * np.linalg.norm((b["pose"].t - a["pose"].t) - (b["truth"].t - a["truth"].t)))
+    return (float(np.median(turns)), float(np.median(shifts))) if turns else (None, None)
+
+
+def changed(texts: Sequence[str]) -> TrackConfig:
+    """``--set``, with each option's own type."""
+    config = TrackConfig()
+    for text in texts:
+        name, _, value = text.partition("=")
+        config = dataclasses.replace(config, **{name: type(getattr(config, name))(value)})
+    return config
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("roots", type=Path, nargs="+")
+    parser.add_argument("--split", default="train")
+    parser.add_argument("--weights", type=Path)
+    parser.add_argument("--frames", type=int)
+    parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="of TrackConfig")
+    parser.add_argument("--json", type=Path, help="every frame, for plots")
+    args = parser.parse_args()
+    config, kept = changed(args.set), []
+    for root in args.roots:
+        data = BopDataset(root, split=args.split)
+        for scene in sorted({scene for scene, _ in data.images()}):
+            frames = SceneFrames(root / args.split / f"{scene:06d}")  # those where nothing is, too
+            images = list(frames.cameras)[: args.frames]
+            with tempfile.TemporaryDirectory() as folder:
+                video = Path(folder) / "scene.mp4"
+                with VideoWriter(video, 30.0) as writer:
+                    for image in images:
+                        writer.write(data.view(scene, image).image)
+                for instance in data.instances(scene, images[0], every=True):
+                    detector = TrueMasks()
+                    estimator = PoseEstimator(data.model(instance.obj_id), weights=args.weights)
+                    tracker = Tracker(estimator.model, pose=instance.T_cam_obj, estimator=estimator, detector=detector,
+                                      config=config)  # fmt: skip
+                    rows = follow(data, scene, images, instance.obj_id, video, tracker, detector)
+                    kept += [
+                        {k: v for k, v in r.items() if k not in ("pose", "truth")} | {"root": root.name} for r in rows
+                    ]
+                    values = "  ".join(f"{k} {v:.3g}" if v is not None else f"{k} -" for k, v in summary(rows).items())
+                    print(f"{root.name} scene {scene} object {instance.obj_id}: {values}", flush=True)
+    if args.json:
+        args.json.write_text(json.dumps(kept))
+
+
+if __name__ == "__main__":
+    main()

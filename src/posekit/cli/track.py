@@ -1,0 +1,260 @@
+"""``posekit track``: objects followed through a video."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from posekit.cli.options import (
+    INPUT,
+    LOOP,
+    OUTPUT,
+    CameraOption,
+    DetectorOption,
+    ForceOption,
+    ModelsOption,
+    OutOption,
+    PresetOption,
+    SymmetryOption,
+    ThreadsOption,
+    UnitsOption,
+    WeightsOption,
+)
+
+if TYPE_CHECKING:
+    from posekit.track import Tracked, Tracker
+    from posekit.video import Frame, Frames, VideoWriter
+
+COLUMNS = "scene_id,im_id,obj_id,score,R,t,time"
+
+
+def track(
+    source: Annotated[
+        str, typer.Argument(help="A video, a folder or glob of pictures, a BOP scene, or a camera's number.")
+    ],
+    model: ModelsOption,
+    camera: CameraOption = None,
+    pose: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="FILE", help="First pose, JSON; once for each mesh.", rich_help_panel=INPUT),
+    ] = None,
+    detector: DetectorOption = None,
+    units: UnitsOption = "auto",
+    symmetry: SymmetryOption = None,
+    preset: PresetOption = "lite",
+    weights: WeightsOption = None,
+    iterations: Annotated[int, typer.Option(help="Comparisons of a frame at most.", rich_help_panel=LOOP)] = 1,
+    restart_angle: Annotated[
+        float, typer.Option(metavar="DEGREES", help="Predicted angle that restarts.", rich_help_panel=LOOP)
+    ] = 25.0,
+    still_angle: Annotated[
+        float,
+        typer.Option(metavar="DEGREES", help="Predicted angle that leaves the pose as it is.", rich_help_panel=LOOP),
+    ] = 2.0,
+    motion: Annotated[
+        Literal["points", "velocity", "none"],
+        typer.Option(help="What foretells the next pose: followed points, the last motion.", rich_help_panel=LOOP),
+    ] = "points",
+    mask: Annotated[
+        Literal["pose", "none"], typer.Option(help="What a frame's mask is taken to be.", rich_help_panel=LOOP)
+    ] = "pose",
+    gain: Annotated[
+        float, typer.Option(min=0, max=1, help="Share of the network's update that is made.", rich_help_panel=LOOP)
+    ] = 1.0,
+    runtime: Annotated[
+        Literal["openvino", "torch"], typer.Option(help="Of the network.", rich_help_panel=LOOP)
+    ] = "openvino",
+    threads: ThreadsOption = None,
+    overlay: Annotated[bool, typer.Option(help="Write overlay.mp4.", rich_help_panel=OUTPUT)] = True,
+    live: Annotated[
+        bool, typer.Option("--live", help="Drop frames to keep up with a camera.", rich_help_panel=OUTPUT)
+    ] = False,
+    frames: Annotated[int | None, typer.Option(min=1, help="Frames at most.", rich_help_panel=OUTPUT)] = None,
+    out: OutOption = None,
+    force: ForceOption = False,
+) -> None:
+    """Follow objects through a video: poses as they come, and an overlay to look at."""
+    from posekit.cli.output import OutputFolder
+
+    folder = OutputFolder(out or Path("posekit-out") / f"{Path(source).stem or 'camera'}-track", force)
+
+    from posekit.errors import ImageError, PromptError
+    from posekit.estimate import EstimateOptions, PoseEstimator
+    from posekit.load import load_pose
+    from posekit.object_model import ObjectModel
+    from posekit.track import TrackConfig, Tracker
+    from posekit.video import LatestFrames, open_frames
+
+    if pose and len(pose) != len(model):
+        raise PromptError(f"{len(pose)} --pose for {len(model)} --model: give one for each, in their order, or none.")
+    config = TrackConfig(
+        restart_angle, still_angle, iterations=iterations, motion=motion, mask=mask, gain=gain, runtime=runtime
+    )
+    starts = [load_pose(path) for path in pose] if pose else [None] * len(model)
+    meshes = [ObjectModel.load(path, units=units, symmetry=symmetry) for path in model]
+    sequence: Frames = open_frames(source, camera)
+    if live:
+        sequence = LatestFrames(sequence)
+    finder = None
+    if not pose or detector is not None:
+        from posekit.cli.prompts import make_detector
+
+        finder, _ = make_detector(detector, meshes, threads=threads)
+    chosen = EstimateOptions(update="correspondence" if preset == "lite" else "regression")
+    trackers = [
+        Tracker(mesh, pose=start, detector=finder, config=config,
+                estimator=PoseEstimator(mesh, preset=preset, weights=weights, options=chosen, threads=threads))
+        for mesh, start in zip(meshes, starts, strict=True)
+    ]  # fmt: skip
+    counts = _run(trackers, sequence, folder, overlay, frames)
+    typer.echo(", ".join(f"{count} {state}" for state, count in counts.states.items()))
+    if counts.problems:
+        typer.echo(f"{len(counts.problems)} frames could not be used; the first: {counts.problems[0]}", err=True)
+    for name in counts.files:
+        typer.echo(f"wrote: {folder.path / name}")
+    if not counts.used:
+        raise ImageError(
+            f"not one frame of {source} could be used: {counts.problems[0] if counts.problems else 'it is empty'}."
+        )
+    if not counts.states.get("tracked", 0) + counts.states.get("restarted", 0):
+        names = ", ".join(m.name for m in meshes)
+        raise PromptError(f"{names} was found in none of {counts.used} frames: pass --pose FILE for the first one.")
+
+
+class _Counts:
+    """What became of the frames."""
+
+    def __init__(self) -> None:
+        self.used = 0
+        self.states: dict[str, int] = {}
+        self.problems: list[str] = []
+        self.files: list[str] = ["poses.jsonl", "poses.csv"]
+
+
+def _run(trackers: Sequence[Tracker], sequence: Frames, folder: Any, overlay: bool, most: int | None) -> _Counts:
+    """Track every frame, and write each as soon as it is done: a killed run keeps its frames."""
+    from posekit.errors import OutputError
+    from posekit.video import VideoWriter
+
+    counts = _Counts()
+    try:
+        folder.path.mkdir(parents=True, exist_ok=True)
+        lines, table = ((folder.path / name).open("w", encoding="utf-8", buffering=1) for name in counts.files)
+    except OSError as error:
+        raise OutputError(f"the folder {folder.path} cannot be written: {error.strerror}.") from error
+    with lines, table, VideoWriter(folder.path / "overlay.mp4", sequence.rate) as writer, _bar(sequence) as show:
+        table.write(COLUMNS + "\n")
+        for done, frame in enumerate(sequence):
+            if most is not None and done >= most:
+                break
+            started = time.perf_counter()
+            results = _step(trackers, frame, counts)
+            seconds = time.perf_counter() - started
+            for k, (tracker, result) in enumerate(zip(trackers, results, strict=True)):
+                lines.write(_line(frame, tracker.model.name, result) + "\n")
+                if result.estimate is not None:
+                    table.write(_row(frame, _number(tracker.model.name, k), result, seconds) + "\n")
+            if overlay and frame.image is not None:
+                _draw(writer, frame, trackers, results)
+            show(seconds, results)
+    if overlay and counts.used:
+        counts.files.append("overlay.mp4")
+    return counts
+
+
+def _step(trackers: Sequence[Tracker], frame: Frame, counts: _Counts) -> list[Tracked]:
+    from posekit.track import LOST, Tracked
+
+    if frame.image is None or frame.camera is None:
+        counts.problems.append(frame.problem)
+        results = [Tracked(LOST) for _ in trackers]
+    else:
+        counts.used += 1
+        results = [tracker.step(frame.image, frame.camera) for tracker in trackers]
+    for result in results:
+        counts.states[result.state] = counts.states.get(result.state, 0) + 1
+    return results
+
+
+def _line(frame: Frame, name: str, result: Tracked) -> str:
+    pose, angle = result.T_cam_obj, result.angle
+    entry: dict[str, Any] = {
+        "frame": frame.number,
+        "model": name,
+        "state": result.state,
+        "T_cam_obj": None if pose is None else pose.matrix.tolist(),
+        "angle_deg": None if angle is None else math.degrees(angle),
+        "score": None if result.estimate is None else result.estimate.score,
+    }
+    if frame.seconds is not None:
+        entry["seconds"] = frame.seconds
+    if frame.problem:
+        entry["problem"] = frame.problem
+    return json.dumps(entry, allow_nan=False)
+
+
+def _row(frame: Frame, obj_id: int, result: Tracked, seconds: float) -> str:
+    """BOP's columns, millimetres."""
+    assert result.estimate is not None
+    pose = result.estimate.T_cam_obj
+    R = " ".join(repr(float(v)) for v in pose.R.ravel())
+    t = " ".join(repr(float(v) * 1000.0) for v in pose.t)
+    return f"{frame.scene},{frame.number},{obj_id},{result.estimate.score!r},{R},{t},{seconds!r}"
+
+
+def _number(name: str, k: int) -> int:
+    """The object's number as BOP has it in the mesh's name, else its place among the meshes."""
+    from posekit.detect.external import model_number
+
+    found = model_number(name)
+    return k + 1 if found is None else found
+
+
+def _draw(writer: VideoWriter, frame: Frame, trackers: Sequence[Tracker], results: Sequence[Tracked]) -> None:
+    from posekit import draw
+
+    assert frame.image is not None and frame.camera is not None
+    picture, told = frame.image, []
+    for tracker, result in zip(trackers, results, strict=True):
+        angle = "" if result.angle is None else f" {math.degrees(result.angle):.1f} deg"
+        told.append(f"{tracker.model.name}: {result.state}{angle}")
+        if result.T_cam_obj is None:
+            continue
+        [drawn] = tracker.estimator.renderer.render(
+            tracker.model, [result.T_cam_obj], frame.camera, rgb=False, coords=False
+        )
+        assert drawn.mask is not None
+        picture = draw.contour(picture, drawn.mask)
+        length = 0.6 * float(tracker.model.extents.max())
+        picture = draw.axes(picture, frame.camera, result.T_cam_obj, length, tracker.model.center)
+    writer.write(draw.caption(picture, f"{frame.number}  " + "  ".join(told)))
+
+
+@contextmanager
+def _bar(sequence: Frames) -> Iterator[Any]:
+    """Frames a second, angle and state, live on a terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+    console = Console(stderr=True)
+    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("", total=sequence.count)
+        mean = 0.0
+
+        def show(seconds: float, results: Sequence[Tracked]) -> None:
+            nonlocal mean
+            mean = seconds if not mean else 0.9 * mean + 0.1 * seconds
+            states = " ".join(
+                r.state if r.angle is None else f"{r.state} {math.degrees(r.angle):.1f} deg" for r in results
+            )
+            bar.update(task, advance=1, description=f"{1 / max(mean, 1e-6):.1f} frames/s  {states}")
+
+        yield show

@@ -1,0 +1,334 @@
+"""Frames in and out: videos, folders of pictures, BOP scenes, cameras. Layer 3, and the only door to PyAV."""
+
+from __future__ import annotations
+
+import glob
+import json
+import logging
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from queue import Empty, Queue
+from threading import Event, Thread
+from types import TracebackType
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from posekit.camera import Camera
+from posekit.errors import ImageError, InputError, OutputError
+from posekit.load import ASSUMED_FOV, load_camera, load_image
+
+log = logging.getLogger("posekit")
+
+Image = NDArray[np.uint8]
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+RATE = 30.0  # frames a second, where nothing says how many
+MOST_FAILURES = 100  # frames of a camera or video that may fail one after the other
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """number: in the source, from 0, or the picture's own in a BOP scene. image: uint8 RGB (H, W, 3), None where it
+    could not be decoded, and ``problem`` says why. camera: of this frame, where it is known. seconds: since the start,
+    where known. scene: of a BOP scene, else 0."""
+
+    number: int
+    image: Image | None
+    camera: Camera | None = None
+    seconds: float | None = None
+    problem: str = ""
+    scene: int = 0
+
+
+class Frames(Protocol):
+    """Frames one after the other. count: how many there are, where that is known before. rate: frames a second."""
+
+    @property
+    def count(self) -> int | None: ...
+
+    @property
+    def rate(self) -> float: ...
+
+    def __iter__(self) -> Iterator[Frame]: ...
+
+
+def open_frames(source: str, camera: str | Path | None = None) -> Frames:
+    """A source of frames by its name.
+
+    source: a video file, a folder of pictures, a glob of them, a BOP scene (a folder with scene_camera.json), or the
+    number of a camera. camera: as `load_camera` takes it; else a BOP scene's own, else a field of view of 60 degrees.
+    Raises InputError where there is no such thing or nothing in it, ImageError where a video cannot be opened.
+    """
+    if source.isdigit() and not Path(source).exists():
+        return CameraFrames(int(source), camera)
+    path = Path(source)
+    if path.is_dir():
+        if (path / "scene_camera.json").is_file():
+            return SceneFrames(path)
+        return PictureFrames(_pictures(path.iterdir(), source), camera)
+    if path.is_file():
+        return PictureFrames([path], camera) if path.suffix.lower() in PICTURES else VideoFrames(path, camera)
+    if glob.has_magic(source):
+        return PictureFrames(_pictures(map(Path, glob.glob(source)), source), camera)  # noqa: PTH207 - absolute globs
+    raise InputError(
+        f"there is no {source}: give a video, a folder or glob of pictures, a BOP scene, or a camera's number."
+    )
+
+
+def _pictures(paths: Any, source: str) -> list[Path]:
+    found = sorted(path for path in paths if path.suffix.lower() in PICTURES)
+    if not found:
+        raise InputError(f"{source} holds no pictures ({', '.join(PICTURES)}).")
+    return found
+
+
+class _Intrinsics:
+    """The camera of each frame, by its size; told once where it is assumed."""
+
+    def __init__(self, camera: str | Path | None) -> None:
+        self.given, self.known = camera, dict[tuple[int, int], Camera]()
+
+    def of(self, image: Image, path: Path | None = None) -> Camera:
+        """Raises CameraError where the given camera does not fit the picture's shape."""
+        size = (image.shape[1], image.shape[0])
+        if size not in self.known:
+            if self.given is not None:
+                self.known[size] = load_camera(self.given, size, path)
+            else:
+                self.known[size] = Camera.from_fov(ASSUMED_FOV, *size)
+                log.warning(
+                    "the camera is not known, so a field of view of 60 degrees is assumed: distances may be wrong by "
+                    "tens of percent. Pass --camera fx,fy,cx,cy or a calibration file."
+                )
+        return self.known[size]
+
+
+class PictureFrames:
+    """Pictures in the order of their names."""
+
+    rate = RATE
+
+    def __init__(self, paths: list[Path], camera: str | Path | None) -> None:
+        self.paths, self.count, self._cameras = paths, len(paths), _Intrinsics(camera)
+
+    def __iter__(self) -> Iterator[Frame]:
+        for number, path in enumerate(self.paths):
+            try:
+                image = load_image(path)
+                yield Frame(number, image, self._cameras.of(image, path), number / self.rate)
+            except InputError as error:
+                yield Frame(number, None, problem=str(error))
+
+
+class SceneFrames:
+    """A BOP scene, with the camera of every picture; frames have the pictures' numbers."""
+
+    rate = RATE
+
+    def __init__(self, folder: Path) -> None:
+        try:
+            cameras = json.loads((folder / "scene_camera.json").read_text(encoding="utf-8"))
+            self.cameras: Mapping[int, Any] = {int(k): v for k, v in sorted(cameras.items(), key=lambda kv: int(kv[0]))}
+        except (OSError, ValueError) as error:
+            raise InputError(f"{folder / 'scene_camera.json'} cannot be read: {error}.") from error
+        self.folder, self.count = folder, len(self.cameras)
+        self.scene = int(folder.name) if folder.name.isdigit() else 0
+        if not self.count:
+            raise InputError(f"{folder / 'scene_camera.json'} names no pictures.")
+
+    def __iter__(self) -> Iterator[Frame]:
+        for place, (number, entry) in enumerate(self.cameras.items()):
+            try:
+                image = load_image(self._path(number))
+                camera = Camera.from_K(np.reshape(entry["cam_K"], (3, 3)), image.shape[1], image.shape[0])
+                yield Frame(number, image, camera, place / self.rate, scene=self.scene)
+            except (InputError, KeyError, ValueError) as error:
+                yield Frame(number, None, problem=str(error), scene=self.scene)
+
+    def _path(self, number: int) -> Path:
+        for kind in ("rgb", "gray"):
+            for suffix in PICTURES:
+                path = self.folder / kind / f"{number:06d}{suffix}"
+                if path.is_file():
+                    return path
+        raise ImageError(f"the scene {self.folder} has no picture {number:06d} in rgb.")
+
+
+class VideoFrames:
+    """A video file, by PyAV. What cannot be decoded is told frame by frame; a truncated file ends early."""
+
+    def __init__(self, path: Path, camera: str | Path | None) -> None:
+        self.path, self._cameras = path, _Intrinsics(camera)
+        with _opened(path) as container:
+            stream = container.streams.video[0]
+            self.rate = float(stream.average_rate or RATE)
+            self.count: int | None = stream.frames or None
+
+    def __iter__(self) -> Iterator[Frame]:
+        import av
+
+        number, failures, start = 0, 0, None
+        with _opened(self.path) as container:
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            packets = container.demux(stream)
+            while failures < MOST_FAILURES:
+                try:
+                    packet = next(packets)
+                    decoded = packet.decode()
+                except StopIteration:
+                    return
+                except (av.FFmpegError, OSError) as error:
+                    failures += 1
+                    yield Frame(number, None, problem=f"frame {number} of {self.path.name} cannot be decoded: {error}")
+                    number += 1
+                    continue
+                for found in decoded:
+                    failures = 0
+                    image = found.to_ndarray(format="rgb24")
+                    start = found.time if start is None else start
+                    seconds = None if found.time is None or start is None else found.time - start
+                    yield self._frame(number, image, seconds)
+                    number += 1
+
+    def _frame(self, number: int, image: Image, seconds: float | None) -> Frame:
+        try:
+            return Frame(number, image, self._cameras.of(image), seconds)
+        except InputError as error:  # the size changed to another shape
+            return Frame(number, None, seconds=seconds, problem=f"frame {number}: {error}")
+
+
+def _opened(path: Path) -> Any:
+    """Raises ImageError where a file is no video, or has no frames."""
+    try:
+        import av
+    except ImportError as error:
+        raise ImageError("reading videos needs PyAV: pip install av.") from error
+    try:
+        container = av.open(str(path))
+    except (av.FFmpegError, OSError) as error:
+        raise ImageError(f"{path} is no video that can be read ({error}): give a video such as an MP4.") from error
+    if not container.streams.video:
+        container.close()
+        raise ImageError(f"{path} has no video in it.")
+    return container
+
+
+class CameraFrames:
+    """A camera of this machine, live: reading waits for the next frame and older ones are dropped by the driver."""
+
+    count: int | None = None
+
+    def __init__(self, index: int, camera: str | Path | None) -> None:
+        self._cameras, self.label = _Intrinsics(camera), f"camera {index}"
+        self.capture = cv2.VideoCapture(index)
+        if not self.capture.isOpened():
+            raise InputError(f"there is no {self.label}, or another program has it: give a video's path otherwise.")
+        self.capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+        self.rate = self.capture.get(cv2.CAP_PROP_FPS) or RATE
+
+    def __iter__(self) -> Iterator[Frame]:
+        number = failures = 0
+        try:
+            while failures < MOST_FAILURES:
+                ok, bgr = self.capture.read()
+                failures = 0 if ok else failures + 1
+                if ok:
+                    image = np.asarray(bgr[..., ::-1].copy(), np.uint8)
+                    yield Frame(number, image, self._cameras.of(image))
+                else:
+                    yield Frame(number, None, problem=f"{self.label} gave no frame")
+                number += 1
+        finally:
+            self.capture.release()
+
+
+class LatestFrames:
+    """Always the newest frame of a source that runs beside: what comes while another is worked on is dropped.
+
+    Whoever reads it is at most one frame behind a camera, however slow. For cameras; of a file almost all is dropped.
+    """
+
+    def __init__(self, source: Frames) -> None:
+        self.source, self.rate = source, source.rate
+        self.count: int | None = None
+
+    def __iter__(self) -> Iterator[Frame]:
+        newest: Queue[Frame | BaseException | None] = Queue(1)
+        ended = Event()
+        reader = Thread(target=_keep_newest, args=(self.source, newest, ended), daemon=True)
+        reader.start()
+        try:
+            while (frame := newest.get()) is not None:
+                if isinstance(frame, BaseException):
+                    raise frame
+                yield frame
+        finally:
+            ended.set()
+
+
+def _keep_newest(source: Frames, newest: Queue[Frame | BaseException | None], ended: Event) -> None:
+    try:
+        for frame in source:
+            if ended.is_set():
+                return
+            with suppress(Empty):
+                newest.get_nowait()
+            newest.put(frame)
+    except BaseException as error:  # told to the reader
+        newest.put(error)
+        return
+    newest.put(None)
+
+
+class VideoWriter:
+    """An MP4 (H.264, 4:2:0) that browsers play, written beside its name and renamed when it is closed.
+
+    Frames of another size than the first are fitted into it. Raises OutputError where it cannot be written.
+    """
+
+    def __init__(self, path: Path, rate: float) -> None:
+        try:
+            import av
+        except ImportError as error:
+            raise OutputError("writing a video needs PyAV: pip install av.") from error
+        self.path, self.part, self.rate = path, path.with_name(f".{path.stem}.part{path.suffix}"), rate
+        self._av = av
+        self._container: Any = None
+        self._stream: Any = None
+
+    def __enter__(self) -> VideoWriter:
+        return self
+
+    def write(self, image: Image) -> None:
+        """uint8 RGB (H, W, 3)."""
+        if self._stream is None:
+            self._begin(image)
+        stream, container = self._stream, self._container
+        if image.shape[:2] != (stream.height, stream.width):
+            image = cv2.resize(image, (stream.width, stream.height), interpolation=cv2.INTER_AREA)
+        frame = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
+        container.mux(stream.encode(frame))
+
+    def _begin(self, image: Image) -> None:
+        height, width = (side - side % 2 for side in image.shape[:2])  # 4:2:0 has even sides
+        try:
+            self._container = self._av.open(str(self.part), "w", format="mp4", options={"movflags": "+faststart"})
+        except OSError as error:
+            raise OutputError(f"{self.path} cannot be written: {error}.") from error
+        rate = Fraction(self.rate).limit_denominator(1001)
+        self._stream = self._container.add_stream("libx264", rate=rate)
+        self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, "yuv420p"
+        self._stream.options = {"preset": "veryfast", "crf": "23"}
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        if self._container is None:
+            return
+        self._container.mux(self._stream.encode())
+        self._container.close()
+        self.part.replace(self.path)  # what was tracked before an interruption is kept

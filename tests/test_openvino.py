@@ -1,0 +1,68 @@
+"""The network through OpenVINO answers as through PyTorch."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from objects import bracket
+from posekit.camera import Camera
+from posekit.errors import ConfigError
+from posekit.geometry import Pose, so3_exp, view_rotation
+from posekit.nets.openvino import OpenVinoPredictor
+from posekit.nets.predictor import NetworkPredictor
+from posekit.nets.rigid import solved
+from posekit.nets.weights import build, load_networks
+from posekit.refine import compare, update_pose
+from posekit.render import Renderer
+from posekit.view import View
+
+CAMERA = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+def test_both_runtimes_answer_alike_and_the_conversion_is_kept(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(kept))
+    networks, model, renderer = load_networks("lite"), bracket(), Renderer()
+    truth = Pose(view_rotation([0.5, -1.0, 0.6]), [0.05, 0.0, 0.7]) @ model.T_obj_ctr.inverse()
+    start = Pose(so3_exp([0.05, 0.02, -0.04]) @ truth.R, truth.t + [0.004, 0.0, 0.01])
+    [drawn] = renderer.render(model, [truth], CAMERA)
+    view, outline = View(drawn.image, CAMERA, drawn.mask), model.outline - model.center
+    results = []
+    runtimes = [NetworkPredictor(networks, bfloat16=False), *(OpenVinoPredictor(networks, b, 1) for b in (False, True))]
+    for predictor in runtimes:
+        [answer], [seen], [rendered] = compare(view, model, outline, [start], predictor, renderer)
+        results.append((answer, update_pose(start, model, answer, seen, rendered, "correspondence")))
+    (torch_answer, torch_pose), *others = results
+    for (answer, pose), pixels, angle in zip(others, (2e-3, 0.6), (1e-4, 0.02), strict=True):
+        assert torch_answer.correspondences is not None and answer.correspondences is not None
+        assert torch_pose is not None and pose is not None
+        np.testing.assert_array_equal(answer.correspondences.source, torch_answer.correspondences.source)
+        away = np.abs(answer.correspondences.target - torch_answer.correspondences.target)
+        assert np.median(away) < pixels / 4 and np.quantile(away, 0.9) < pixels
+        assert answer.angle == pytest.approx(torch_answer.angle, abs=angle)
+        np.testing.assert_allclose(pose.R, torch_pose.R, atol=angle)
+    [folder] = (kept / "posekit" / "openvino").iterdir()
+    assert sorted(p.name for p in folder.iterdir()) == ["svnet.bin", "svnet.xml"]
+    assert networks.digest in folder.name
+
+
+def test_elimination_solves_as_the_library_does() -> None:
+    rng = torch.Generator().manual_seed(0)
+    J, g = torch.randn(5, 20, 6, generator=rng), torch.randn(5, 6, generator=rng)
+    A = J.transpose(1, 2) @ J
+    traced = torch.jit.trace(solved, (A, g), check_trace=False)  # type: ignore[no-untyped-call]
+    torch.testing.assert_close(traced(A, g), solved(A, g), rtol=1e-4, atol=1e-5)
+    assert "linalg_solve" not in str(traced.graph)
+
+
+def test_the_paper_preset_is_refused() -> None:
+    with pytest.raises(ConfigError, match="preset lite, not paper"):
+        OpenVinoPredictor(build("paper"))

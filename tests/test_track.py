@@ -1,0 +1,324 @@
+"""Tracking: with an oracle instead of a network what the loop does, with the shipped network the command."""
+
+from __future__ import annotations
+
+import json
+import tracemalloc
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from bop_scene import write_scene
+from objects import bracket
+from posekit.camera import Camera
+from posekit.cli.app import app
+from posekit.data.example import Example, make_example, ply
+from posekit.errors import CameraError, ConfigError
+from posekit.geometry import Pose, rotation_angle, so3_exp, view_rotation
+from posekit.metrics import pose_error
+from posekit.object_model import ObjectModel
+from posekit.odometry import follow_points, look
+from posekit.render import Renderer
+from posekit.results import Detection, Estimate
+from posekit.track import LOST, RESTARTED, TRACKED, TrackConfig, Tracker
+from posekit.video import VideoFrames, VideoWriter
+from posekit.view import View
+from test_refine import Oracle
+
+CAMERA = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
+STEADY = TrackConfig(gain=1.0, still_deg=0.0)
+
+
+@pytest.fixture(scope="module")
+def renderer() -> Renderer:
+    return Renderer()
+
+
+@pytest.fixture(scope="module")
+def model() -> ObjectModel:
+    return bracket()
+
+
+def path(model: ObjectModel, k: float) -> Pose:
+    """Two degrees and 3 mm a frame about the centre."""
+    R = so3_exp([0.0, 0.035 * k, 0.01 * k]) @ view_rotation([0.5, -1.0, 0.6])
+    return Pose(R, [0.003 * k - 0.05, 0.0, 0.6]) @ model.T_obj_ctr.inverse()
+
+
+def backdrop() -> np.ndarray:
+    return np.random.default_rng(1).integers(90, 160, (480, 640, 3)).astype(np.uint8)
+
+
+def photograph(renderer: Renderer, model: ObjectModel, pose: Pose | None) -> View:
+    image, mask = backdrop(), np.zeros((480, 640), bool)
+    if pose is not None:
+        [drawn] = renderer.render(model, [pose], CAMERA)
+        assert drawn.mask is not None
+        mask, image = drawn.mask, np.where(drawn.mask[..., None], drawn.image, image)
+    return View(image, CAMERA, mask)
+
+
+class Estimator:
+    """Stands for a PoseEstimator: its first pose is ``found``."""
+
+    def __init__(self, model: ObjectModel, renderer: Renderer, found: Pose | None = None, score: float = 0.9) -> None:
+        self.model, self.renderer, self.found, self.score = model, renderer, found, score
+
+    def estimate(self, view: View, detections: Sequence[Detection]) -> list[Estimate]:
+        if self.found is None:
+            return []
+        return [Estimate(self.found, 0.1, 3, True, self.score, d.box, self.model.name, d) for d in detections]
+
+
+class Finder:
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
+        self.calls += 1
+        return [Detection((10.0, 10.0, 50.0, 50.0))]
+
+
+def tracker(model: ObjectModel, renderer: Renderer, truth: Pose, config: TrackConfig = STEADY, **more) -> Tracker:  # type: ignore[no-untyped-def]
+    more.setdefault("estimator", Estimator(model, renderer))
+    return Tracker(model, CAMERA, predictor=Oracle(model, truth), config=config, **more)
+
+
+@pytest.mark.parametrize("motion", ["points", "velocity", "none"])
+def test_an_oracle_is_followed(model: ObjectModel, renderer: Renderer, motion: str) -> None:
+    following = tracker(model, renderer, path(model, 0), replace(STEADY, motion=motion), pose=path(model, 0))
+    for k in range(6):
+        following.predictor.truth = path(model, k)  # type: ignore[attr-defined]
+        found = following.step(photograph(renderer, model, path(model, k)).image)
+        assert found.state == TRACKED and found.T_cam_obj is not None and found.estimate is not None
+        turn, shift = pose_error(found.T_cam_obj, path(model, k))
+        assert np.rad2deg(turn) < 0.1 and shift < 5e-4
+        assert found.estimate.score > 0.8 and set(found.estimate.timings) == {"network", "total"}
+
+
+def test_followed_points_alone_carry_a_pose(model: ObjectModel, renderer: Renderer) -> None:
+    before, after = (photograph(renderer, model, path(model, k)) for k in (0, 1))
+    found = follow_points(look(before, path(model, 0), model, renderer), after, model)
+    assert found.pose is not None and found.share > 0.3
+    still = pose_error(path(model, 0), path(model, 1))
+    moved = pose_error(found.pose, path(model, 1))
+    assert moved[0] < 0.35 * still[0] and moved[1] < 0.35 * still[1]
+    flat = View(np.full_like(after.image, 128), CAMERA)
+    assert follow_points(look(flat, path(model, 0), model, renderer), flat, model).pose is None
+
+
+def test_the_gain_is_the_share_of_the_update(model: ObjectModel, renderer: Renderer) -> None:
+    turns = []
+    for gain in (0.0, 0.5, 1.0):
+        config = TrackConfig(gain=gain, still_deg=0.0, motion="none")
+        following = tracker(model, renderer, path(model, 2), config, pose=path(model, 0))
+        found = following.step(photograph(renderer, model, path(model, 2)).image).T_cam_obj
+        assert found is not None
+        turns.append(
+            rotation_angle(found.R @ path(model, 0).R.T) / rotation_angle(path(model, 2).R @ path(model, 0).R.T)
+        )
+    np.testing.assert_allclose(turns, [0, 0.5, 1], atol=0.02)
+
+
+def test_a_small_predicted_angle_leaves_the_pose_where_asked(model: ObjectModel, renderer: Renderer) -> None:
+    config = replace(STEADY, motion="none", still_deg=5.0)
+    following = tracker(model, renderer, path(model, 1), config, pose=path(model, 0))
+    found = following.step(photograph(renderer, model, path(model, 1)).image)
+    assert found.T_cam_obj is not None
+    np.testing.assert_array_equal(found.T_cam_obj.matrix, path(model, 0).matrix)
+
+
+def test_a_large_turn_is_compared_again(model: ObjectModel, renderer: Renderer) -> None:
+    for iterations, calls in ((1, 1), (3, 2)):
+        config = replace(STEADY, motion="none", iterations=iterations)
+        following = tracker(model, renderer, path(model, 5), config, pose=path(model, 0))
+        following.step(photograph(renderer, model, path(model, 5)).image)
+        assert following.predictor.calls == calls  # type: ignore[attr-defined]
+
+
+def test_a_large_predicted_angle_restarts(model: ObjectModel, renderer: Renderer) -> None:
+    truth, finder = path(model, 0), Finder()
+    following = tracker(
+        model, renderer, truth, pose=truth, estimator=Estimator(model, renderer, truth), detector=finder
+    )
+    following.predictor.angles = [0.6]  # type: ignore[attr-defined]  # above 25 degrees
+    found = following.step(photograph(renderer, model, truth).image)
+    assert found.state == RESTARTED and finder.calls == 1
+    following.predictor.angles = [0.01]  # type: ignore[attr-defined]
+    assert following.step(photograph(renderer, model, truth).image).state == TRACKED
+
+
+def test_what_disappears_is_lost_soon_and_found_again(model: ObjectModel, renderer: Renderer) -> None:
+    truth, finder = path(model, 0), Finder()
+    estimator = Estimator(model, renderer)
+    following = tracker(model, renderer, truth, pose=truth, estimator=estimator, detector=finder)
+    there, gone = (photograph(renderer, model, pose).image for pose in (truth, None))
+    assert following.step(there).state == TRACKED
+    states = [following.step(gone).state for _ in range(12)]
+    assert states[:2] == [TRACKED, TRACKED] and set(states[2:]) == {LOST}
+    assert finder.calls == 2, "not every frame is searched"
+    estimator.found, estimator.score = truth, 0.1
+    assert {following.step(there).state for _ in range(6)} == {LOST}, "a bad first pose is not taken"
+    estimator.score = 0.9
+    states = [following.step(there).state for _ in range(6)]
+    assert states.count(RESTARTED) == 1 and states[-1] == TRACKED
+
+
+def test_what_leaves_the_picture_is_lost_at_once(model: ObjectModel, renderer: Renderer) -> None:
+    outside = Pose(path(model, 0).R, [0.6, 0.0, 0.6])
+    following = tracker(model, renderer, outside, replace(STEADY, motion="none"), pose=path(model, 0))
+    assert following.step(photograph(renderer, model, path(model, 0)).image).state == LOST
+    assert following.step(photograph(renderer, model, path(model, 0)).image).state == LOST, "nobody searches"
+
+
+def test_the_mask_is_the_poses_or_none(model: ObjectModel, renderer: Renderer) -> None:
+    seen = []
+    for mask in ("pose", "none"):
+        following = tracker(model, renderer, path(model, 0), replace(STEADY, mask=mask), pose=path(model, 0))
+        answer = following.predictor.predict
+        following.predictor.predict = lambda o, r, answer=answer: seen.append((o[0].mask, r[0].mask)) or answer(o, r)  # type: ignore
+        following.step(photograph(renderer, model, path(model, 0)).image)
+    np.testing.assert_array_equal(*seen[0])
+    assert seen[1][0] is None
+
+
+def test_memory_does_not_grow(model: ObjectModel, renderer: Renderer) -> None:
+    """After 20 frames less than 1 kB a frame, or 10 MB in 10,000 frames."""
+    frames = [photograph(renderer, model, path(model, k)).image for k in (0, 1)]
+    following = tracker(model, renderer, path(model, 0), pose=path(model, 0))
+    sizes = []
+    tracemalloc.start()
+    try:
+        for k in range(80):
+            following.predictor.truth = path(model, k % 2)  # type: ignore[attr-defined]
+            assert following.step(frames[k % 2]).state == TRACKED
+            sizes.append(tracemalloc.get_traced_memory()[0])
+    finally:
+        tracemalloc.stop()
+    assert (sizes[79] - sizes[19]) / 60 < 1000
+
+
+def test_what_cannot_be_tracked_is_said(model: ObjectModel, renderer: Renderer) -> None:
+    with pytest.raises(ConfigError, match="first pose, or a detector"):
+        Tracker(model, CAMERA, estimator=SimpleNamespace())  # type: ignore[arg-type]
+    following = Tracker(
+        model,
+        pose=path(model, 0),
+        estimator=Estimator(model, renderer),
+        predictor=Oracle(model, path(model, 0)),  # type: ignore[arg-type]
+    )
+    with pytest.raises(CameraError, match="without a camera"):
+        following.step(backdrop())
+    for wrong in (
+        {"still_deg": 30},
+        {"iterations": 0},
+        {"gain": 2},
+        {"mask": "true"},
+        {"motion": "x"},
+        {"runtime": "x"},
+    ):
+        with pytest.raises(ConfigError):
+            TrackConfig(**wrong)
+
+
+# --- the command ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def example(renderer: Renderer) -> Example:
+    return make_example(renderer)
+
+
+@pytest.fixture(scope="module")
+def folder(example: Example, renderer: Renderer, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A video in which the example's camera turns a little, its mesh and its first pose."""
+    folder = tmp_path_factory.mktemp("track")
+    (folder / "toy.ply").write_text(ply(example.model))
+    (folder / "pose.json").write_text(json.dumps({"T_cam_obj": example.T_cam_obj.matrix.tolist()}))
+    with VideoWriter(folder / "toy.mp4", 30.0) as writer:
+        for k in range(5):
+            writer.write(np.roll(example.view.image, 2 * k, axis=1))
+    return folder
+
+
+def run(folder: Path, *flags: object, source: str = "toy.mp4", cache: Path | None = None):  # type: ignore[no-untyped-def]
+    camera = make_camera_flag(folder)
+    arguments = ["track", str(folder / source), "-m", str(folder / "toy.ply"), *camera, *map(str, flags)]
+    return CliRunner().invoke(app, arguments)
+
+
+def make_camera_flag(folder: Path) -> list[str]:
+    return ["--camera", (folder / "camera.txt").read_text()] if (folder / "camera.txt").exists() else []
+
+
+def test_a_video_becomes_poses_and_an_overlay(
+    example: Example, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    c = example.view.camera
+    (folder / "camera.txt").write_text(f"{c.fx},{c.fy},{c.cx},{c.cy}")
+    done = run(folder, "--pose", folder / "pose.json", "--out", tmp_path / "out", "--gain", 1, "--still-angle", 0)
+    assert done.exit_code == 0, done.output
+    assert "5 tracked" in done.stdout
+    lines = [json.loads(line) for line in (tmp_path / "out" / "poses.jsonl").read_text().splitlines()]
+    assert [line["frame"] for line in lines] == list(range(5))
+    assert all(line["state"] == "tracked" and 0 <= line["angle_deg"] < 25 for line in lines)
+    first = Pose.from_matrix(lines[0]["T_cam_obj"])
+    turn, shift = pose_error(first, example.T_cam_obj)
+    assert np.rad2deg(turn) < 10 and shift < 0.05
+    moved = c.project(Pose.from_matrix(lines[4]["T_cam_obj"]).t) - c.project(first.t)
+    assert abs(moved[0] - 8) < 3 and abs(moved[1]) < 3, "8 pixels to the right"
+    rows = (tmp_path / "out" / "poses.csv").read_text().splitlines()
+    assert rows[0] == "scene_id,im_id,obj_id,score,R,t,time" and len(rows) == 6
+    assert float(rows[1].split(",")[5].split()[2]) == pytest.approx(1000 * first.t[2])
+    assert len(list(VideoFrames(tmp_path / "out" / "overlay.mp4", None))) == 5
+    again = run(folder, "--pose", folder / "pose.json", "--out", tmp_path / "out")
+    assert again.exit_code == 1 and "--force" in again.stderr
+
+
+def test_nothing_to_track_is_an_error(folder: Path, tmp_path: Path) -> None:
+    (folder / "damaged").mkdir(exist_ok=True)
+    (folder / "damaged" / "0.png").write_bytes(b"no picture")
+    flags = ("--pose", folder / "pose.json", "--runtime", "torch")
+    result = run(folder, *flags, "--out", tmp_path / "a", source="damaged")
+    assert result.exit_code == 1 and "not one frame" in result.stderr
+    [line] = (tmp_path / "a" / "poses.jsonl").read_text().splitlines()
+    assert json.loads(line)["state"] == "lost" and "problem" in json.loads(line)
+    result = run(folder, *flags, "--pose", folder / "pose.json", "--out", tmp_path / "b")
+    assert result.exit_code == 1 and "2 --pose for 1 --model" in result.stderr
+    result = run(folder, *flags, "--out", tmp_path / "c", source="none.mp4")
+    assert result.exit_code == 1 and "there is no" in result.stderr
+
+
+# --- eval --stage track ---------------------------------------------------------------------------------------------
+
+
+def still_scene(root: Path) -> Path:
+    """The first picture of a small scene five times over."""
+    write_scene(root, images=1)
+    folder = root / "test" / "000002"
+    for name in ("scene_gt", "scene_gt_info", "scene_camera"):
+        entries = json.loads((folder / f"{name}.json").read_text())
+        (folder / f"{name}.json").write_text(json.dumps({str(k): entries["0"] for k in range(5)}))
+    for file in [*folder.glob("*/000000.png"), *folder.glob("*/000000_*.png")]:
+        for k in range(1, 5):
+            (file.parent / file.name.replace("000000", f"{k:06d}", 1)).write_bytes(file.read_bytes())
+    return root
+
+
+def test_eval_follows_a_sequence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    root = still_scene(tmp_path / "still")
+    command = ["eval", "--stage", "track", "--root", str(root), "--min-visible", "0.5", "--out", str(tmp_path / "out")]
+    assert CliRunner().invoke(app, command).exit_code == 0
+    results = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert results["stage"] == "track" and results["counts"]["instances"] == 10
+    states = [i["state"] for i in results["instances"] if i["found"]]
+    assert len(states) >= 5 and set(states) <= {"tracked", "restarted"}
+    done = CliRunner().invoke(app, [*command[:-1], str(tmp_path / "b"), "--images", "3"])
+    assert done.exit_code == 1 and "whole sequences" in done.stderr
