@@ -3,8 +3,8 @@
     python benchmarks/paper_overfit.py [--minutes 40] [--photos 2] [--size 128x96] [--width 0.25]
 
 Renders a few photographs of one object, trains `--recipe paper` on them (AdamW with a rate that falls along a cosine,
-which gets there sooner than SGD at a constant one), and refines each photograph's pose from DeepIM's disturbances with
-the weights that came out. Prints the share within (5 degrees, 5 cm) as the training goes on.
+which gets there sooner than SGD at a constant one), and estimates each photograph's pose with the weights that came
+out. Prints the share within (5 degrees, 5 cm) as the training goes on.
 """
 
 from __future__ import annotations
@@ -18,23 +18,25 @@ import cv2
 import numpy as np
 import torch
 
-from posekit.camera import Camera
+from posekit.camera import Camera, mask_box
 from posekit.data.bop import BopDataset
 from posekit.data.procedural import noise_image, random_object
-from posekit.data.scenes import disturbed_pose
+from posekit.data.scenes import SceneConfig, disturbed_box, disturbed_pose
 from posekit.geometry import Pose, random_rotation
+from posekit.hypotheses import MVNetSearch
 from posekit.metrics import pose_error, within
 from posekit.nets.predictor import NetworkPredictor
 from posekit.nets.weights import load_networks
 from posekit.object_model import ObjectModel
 from posekit.refine import RefineOptions, refine
 from posekit.render import Renderer
+from posekit.results import Detection
 from posekit.train.config import changed, default_config
 from posekit.train.loop import Progress, Trainer, make_fabric
 from posekit.train.pose import make_task
 from posekit.train.sources import Sources
 
-DRAWS = 10  # disturbances of each photograph
+DRAWS = 10  # boxes and disturbances of each photograph
 
 
 def write_set(root: Path, model: ObjectModel, count: int, rng: np.random.Generator) -> BopDataset:
@@ -68,21 +70,28 @@ def write_set(root: Path, model: ObjectModel, count: int, rng: np.random.Generat
     return BopDataset(root, "train", None)
 
 
-def share_within_5(dataset: BopDataset, weights: Path) -> float:
-    """Of all photographs and disturbances, after at most 10 refinements by the paper's policy."""
+def shares_within_5(dataset: BopDataset, weights: Path) -> tuple[float, float]:
+    """Of all photographs and draws, after at most 10 refinements by the paper's policy: from MV-Net's first pose in a
+    detector's inexact box, as the networks were trained to be used, and from DeepIM's disturbances of the truth, which
+    SV-Net meets in training only where MV-Net's first pose is far off."""
     networks, renderer, rng = load_networks("paper", weights), Renderer(), np.random.default_rng(7)
     predictor, options = NetworkPredictor(networks), RefineOptions(update="regression", iterations=10)
-    errors = []
+    within_5: tuple[list[bool], list[bool]] = [], []
     for scene, image in dataset.images():
         (instance,) = dataset.instances(scene, image, every=True)
-        model = dataset.model(instance.obj_id)
-        view = dataset.view(scene, image).with_mask(instance.mask())
-        truth = instance.T_cam_obj @ model.T_obj_ctr
-        starts = [disturbed_pose(truth, model.diameter, rng) @ model.T_obj_ctr.inverse() for _ in range(DRAWS)]
-        found = refine(view, model, starts, predictor, renderer, options)
-        errors += [pose_error(f.T_cam_obj, instance.T_cam_obj, [Pose.identity()]) for f in found]
-    turns, shifts = np.array(errors).T
-    return float(within(turns, shifts, 5, 5).mean())
+        model, mask = dataset.model(instance.obj_id), instance.mask()
+        view, box = dataset.view(scene, image).with_mask(mask), mask_box(mask)
+        assert box is not None
+        search, truth = MVNetSearch(model, networks, renderer), instance.T_cam_obj
+        for _ in range(DRAWS):
+            detection = Detection(disturbed_box(box, SceneConfig(), rng), mask)
+            first = [h.T_cam_obj for h in search.search(view, detection, 1)]
+            disturbed = disturbed_pose(truth @ model.T_obj_ctr, model.diameter, rng) @ model.T_obj_ctr.inverse()
+            for starts, hits in zip((first, [disturbed]), within_5, strict=True):
+                found = refine(view, model, starts, predictor, renderer, options)
+                errors = [pose_error(f.T_cam_obj, truth, [Pose.identity()]) for f in found]
+                hits.append(any(bool(within(*np.array(e)[:, None], 5, 5)[0]) for e in errors))
+    return float(np.mean(within_5[0])), float(np.mean(within_5[1]))
 
 
 def main() -> None:
@@ -118,9 +127,10 @@ def main() -> None:
         def show(_: Progress) -> None:
             if trainer.step % args.every == 0:
                 task.export(trainer.average.module, Path(folder), {})
-                share = share_within_5(dataset, Path(folder))
+                first, disturbed = shares_within_5(dataset, Path(folder))
                 means = "  ".join(f"{k} {v:.3f}" for k, v in trainer.means.items())
-                print(f"step {trainer.step}, {trainer.seconds:.0f} s: (5, 5) {share:.1%}  {means}", flush=True)
+                print(f"step {trainer.step}, {trainer.seconds:.0f} s: (5, 5) {first:.1%} from MV-Net's first poses, "
+                      f"{disturbed:.1%} from DeepIM's noise  {means}", flush=True)  # fmt: skip
 
         trainer.show = show
         trainer.run()

@@ -67,7 +67,7 @@ def test_augmentation_keeps_the_truth(pairs: list[Pair]) -> None:
 
 
 def test_a_mask_can_be_the_last_poses(pairs: list[Pair]) -> None:
-    plain = AugmentConfig(0, 0, 0, 1.0, 1, 0, 0, 0, source_mask=1.0)
+    plain = AugmentConfig(0, 0, 0, 1.0, dilate=1, no_mask=0, box_mask=0, cut_mask=0, source_mask=1.0)
     overlaps = []
     for k, pair in enumerate(pairs):
         mask = augment(pair, [], [], plain, np.random.default_rng(k)).observed[..., 3] > 0
@@ -99,6 +99,15 @@ def test_masks_go_wrong_as_told(config: AugmentConfig, check) -> None:  # type: 
     mask[40:70, 60:100] = True
     mask[50:60, 70:80] = False
     assert check(disturb_mask(mask, config, np.random.default_rng(0)), mask)
+
+
+@pytest.mark.parametrize(("grown", "least", "most"), [(0.0, 0.7, 0.97), (0.5, 0.97, 1.03), (1.0, 1.03, 1.3)])
+def test_masks_are_too_large_as_often_as_told(grown: float, least: float, most: float) -> None:
+    mask = np.zeros((120, 160), bool)
+    mask[30:90, 40:120] = True
+    config, rng = AugmentConfig(grown=grown, no_mask=0, box_mask=0, cut_mask=0), np.random.default_rng(3)
+    areas = [disturb_mask(mask, config, rng).sum() / mask.sum() for _ in range(200)]
+    assert least < np.mean(areas) < most
 
 
 def test_procedural_objects_are_valid_and_various() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,10 @@ from posekit.data.example import make_example
 from posekit.errors import ConfigError, WeightsError
 from posekit.estimate import EstimateOptions, PoseEstimator, score
 from posekit.geometry import Pose, PoseNoise
-from posekit.hypotheses import Agreement
+from posekit.hypotheses import Agreement, poses_beside
 from posekit.metrics import pose_error
 from posekit.nets.weights import build, save_networks
+from posekit.refine import pose_change
 from posekit.render import Renderer
 from posekit.results import Detection
 from posekit.view import View
@@ -117,6 +119,24 @@ def test_a_pose_outside_the_picture_does_not_break_the_loop(examples) -> None:
     found = estimator.refine(example.view, away)
     assert np.isfinite(found.T_cam_obj.matrix).all()
     assert isinstance(found.box, tuple) and isinstance(example.view.camera, Camera)
+
+
+def test_poses_beside_a_known_one_compete_with_it(examples) -> None:
+    example = examples[0]
+    around = poses_beside(example.T_cam_obj, example.model, np.deg2rad(12))
+    centre = example.model.center
+    for pose in around:
+        turn, _ = pose_change(pose, example.T_cam_obj)
+        assert np.isclose(np.rad2deg(turn), 12)
+        np.testing.assert_allclose(pose.apply(centre), example.T_cam_obj.apply(centre), atol=1e-9)
+    assert len({tuple(np.round(pose.R.ravel(), 6)) for pose in around}) == 4
+    far = poses_beside(example.T_cam_obj, example.model, np.deg2rad(30))[0]
+    asked = EstimateOptions(iterations=4, stop_angle_deg=0.01)  # nothing converges
+    both, alone = (
+        PoseEstimator(example.model, options=replace(asked, beside=beside)).refine(example.view, far)
+        for beside in (True, False)
+    )
+    assert both.iterations == alone.iterations == 4 and both.score >= alone.score
 
 
 def test_the_score_prefers_small_angles_and_agreement() -> None:

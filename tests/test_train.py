@@ -496,6 +496,19 @@ def test_options_override_a_configuration() -> None:
 # --- the command line ---
 
 
+@pytest.mark.parametrize(("asked", "mvnet"), [([], 0), (["--mvnet", "4"], 4)])
+def test_given_meshes_start_from_the_shipped_weights(
+    asked: list[str], mvnet: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chosen: list[TrainConfig] = []
+    monkeypatch.setattr("posekit.train.pose.train_pose", lambda config, *_: chosen.append(config) or [])
+    arguments = ["train", "pose", "--model", "mine.ply", "--minutes", "30", "--out", str(tmp_path / "mine"), *asked]
+    assert CliRunner().invoke(app, arguments).exit_code == 0
+    (config,) = chosen
+    assert config.sources.init == "shipped" and config.minutes == 30 and config.epochs == 0
+    assert config.stream.mvnet == mvnet and config.optimiser.rate < TrainConfig().optimiser.rate
+
+
 def test_the_command_trains_for_a_mesh_and_reports(tmp_path: Path) -> None:
     mesh = bop_folder(tmp_path / "set") / "models" / "obj_000001.ply"
     file = tmp_path / "a.toml"

@@ -12,7 +12,7 @@ import numpy as np
 from posekit.camera import Box
 from posekit.errors import ConfigError
 from posekit.geometry import Pose
-from posekit.hypotheses import Agreement, Hypothesis, MVNetSearch, TemplateSearch, agreements
+from posekit.hypotheses import Agreement, Hypothesis, MVNetSearch, TemplateSearch, agreements, poses_beside
 from posekit.nets.predictor import NetworkPredictor
 from posekit.nets.weights import load_networks
 from posekit.object_model import ObjectModel
@@ -23,12 +23,14 @@ from posekit.view import View
 
 INITS = ("templates", "mvnet")
 HEATS, FINALISTS = 3, 2  # iterations after which only so many hypotheses go on
+BESIDE = float(np.deg2rad(12.0))  # how far from a known pose others are tried
 
 
 @dataclass(frozen=True)
 class EstimateOptions:
-    """init: where first poses come from. hypotheses: how many of them are refined. seed: for whatever is drawn at
-    random. The rest is RefineOptions', with the angle in degrees."""
+    """init: where first poses come from. hypotheses: how many of them are refined. beside: whether poses beside a known
+    one are tried too where it does not converge at once. seed: for whatever is drawn at random. The rest is
+    RefineOptions', with the angle in degrees."""
 
     init: str = "templates"
     hypotheses: int = 5
@@ -37,6 +39,7 @@ class EstimateOptions:
     iterations: int = 50
     stop_angle_deg: float = 2.0
     seed: int = 0
+    beside: bool = True
 
     def __post_init__(self) -> None:
         if self.init not in INITS:
@@ -99,9 +102,17 @@ class PoseEstimator:
         return estimates
 
     def refine(self, view: View, T_cam_obj: Pose) -> Estimate:
-        """Refine a known pose; view.mask, where there is one, helps."""
+        """Refine a known pose; view.mask, where there is one, helps. Where it does not converge within a few
+        iterations, the four poses turned by 12 degrees towards a tetrahedron's corners compete with it."""
         started = time.perf_counter()
-        refined = refine(view, self.model, [T_cam_obj], self.predictor, self.renderer, self.options.refine_options)
+        options = self.options.refine_options
+        if self.options.beside and options.stop == "angle" and options.iterations > HEATS:
+            heats = self._heats(view, [T_cam_obj])
+            if not heats[0].converged:
+                heats += self._heats(view, poses_beside(T_cam_obj, self.model, BESIDE))
+            refined = self._finals(view, heats)
+        else:
+            refined = refine(view, self.model, [T_cam_obj], self.predictor, self.renderer, options)
         seconds = time.perf_counter() - started
         return self._choose(view, refined, None, {"refine": seconds, "total": seconds})
 
@@ -110,8 +121,15 @@ class PoseEstimator:
         options = self.options.refine_options
         if len(starts) <= FINALISTS or options.iterations <= HEATS:
             return refine(view, self.model, starts, self.predictor, self.renderer, options)
-        short = replace(options, iterations=HEATS)
-        heats = refine(view, self.model, starts, self.predictor, self.renderer, short)
+        return self._finals(view, self._heats(view, starts))
+
+    def _heats(self, view: View, starts: Sequence[Pose]) -> list[Refinement]:
+        short = replace(self.options.refine_options, iterations=HEATS)
+        return refine(view, self.model, starts, self.predictor, self.renderer, short)
+
+    def _finals(self, view: View, heats: Sequence[Refinement]) -> list[Refinement]:
+        """The best go on; with the paper's policy only where they have not converged."""
+        options = self.options.refine_options
         order = np.argsort([-s for s in self._scores(view, heats)], kind="stable")
         finalists = [heats[k] for k in order[:FINALISTS]]
         there = [heat.converged and options.stop == "angle" for heat in finalists]

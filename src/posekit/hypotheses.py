@@ -219,6 +219,14 @@ class MVNetSearch:
         return frontal_pose(self.camera, self.distance, crop_camera)
 
 
+def poses_beside(T_cam_obj: Pose, model: ObjectModel, angle: float) -> list[Pose]:
+    """The pose turned by ``angle`` (radians) about the object's centre, towards each corner of a tetrahedron."""
+    T_cam_ctr = T_cam_obj @ model.T_obj_ctr
+    corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3)
+    turned = [Pose(so3_exp(angle * corner) @ T_cam_ctr.R, T_cam_ctr.t) for corner in corners]
+    return [T @ model.T_obj_ctr.inverse() for T in turned]
+
+
 @dataclass(frozen=True)
 class Agreement:
     """How well a pose explains a photograph, measured by rendering it there.

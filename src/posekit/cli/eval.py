@@ -13,6 +13,7 @@ from posekit.cli.estimate import HypothesesOption, InitOption
 from posekit.cli.options import (
     LOOP,
     OUTPUT,
+    BesideOption,
     IterationsOption,
     PresetOption,
     SeedOption,
@@ -80,6 +81,7 @@ def evaluate(
     stop: StopOption = "angle",
     iterations: IterationsOption = 50,
     stop_angle: StopAngleOption = 2.0,
+    beside: BesideOption = True,
     seed: SeedOption = 0,
     threads: Annotated[int, typer.Option(min=1, help="Of torch, in each worker.", rich_help_panel=LOOP)] = 1,
     workers: Annotated[int, typer.Option(min=1, help="Processes.", rich_help_panel=LOOP)] = 1,
@@ -125,7 +127,7 @@ def evaluate(
         noise=_noise(noise),
         preset=preset,
         weights=weights,
-        estimate=EstimateOptions(init, hypotheses, update, stop, iterations, stop_angle, seed),
+        estimate=EstimateOptions(init, hypotheses, update, stop, iterations, stop_angle, seed, beside),
         threads=threads,
         workers=workers,
     )

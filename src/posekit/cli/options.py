@@ -79,6 +79,14 @@ IterationsOption = Annotated[int, typer.Option(help="At most; with --stop fixed 
 StopAngleOption = Annotated[
     float, typer.Option(metavar="DEGREES", help="Predicted angle that ends the loop.", rich_help_panel=LOOP)
 ]
+BesideOption = Annotated[
+    bool,
+    typer.Option(
+        "--beside/--alone",
+        help="Also try poses 12 degrees beside the given one where it does not converge at once.",
+        rich_help_panel=LOOP,
+    ),
+]
 SeedOption = Annotated[int, typer.Option(help="The same seed gives the same result.", rich_help_panel=LOOP)]
 ThreadsOption = Annotated[
     int | None, typer.Option(min=1, help="Threads of torch; by default its own choice.", rich_help_panel=LOOP)

@@ -9,6 +9,7 @@ import typer
 
 from posekit.cli.options import (
     INPUT,
+    BesideOption,
     BoxOption,
     CameraOption,
     ForceOption,
@@ -52,6 +53,7 @@ def refine(
     stop: StopOption = "angle",
     iterations: IterationsOption = 50,
     stop_angle: StopAngleOption = 2.0,
+    beside: BesideOption = True,
     seed: SeedOption = 0,
     threads: ThreadsOption = None,
     out: OutOption = None,
@@ -68,7 +70,9 @@ def refine(
     from posekit.load import load_pose, load_view
     from posekit.object_model import ObjectModel
 
-    options = EstimateOptions(update=update, stop=stop, iterations=iterations, stop_angle_deg=stop_angle, seed=seed)
+    options = EstimateOptions(
+        update=update, stop=stop, iterations=iterations, stop_angle_deg=stop_angle, seed=seed, beside=beside
+    )
     start = load_pose(pose)
     view = load_view(image, camera)
     mesh = ObjectModel.load(model, units=units, symmetry=symmetry)

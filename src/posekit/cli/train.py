@@ -66,6 +66,15 @@ def pose(
     steps: Annotated[int | None, typer.Option(help="Optimiser steps.", rich_help_panel=SCHEDULE)] = None,
     batch: Annotated[int | None, typer.Option(help="Samples per process and step.", rich_help_panel=SCHEDULE)] = None,
     rate: Annotated[float | None, typer.Option(help="Highest learning rate.", rich_help_panel=SCHEDULE)] = None,
+    mvnet: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            help="MV-Net's samples beside them; by default 8, but 0 where shipped weights learn given meshes, "
+            "which leaves the first pose to the template search.",
+            rich_help_panel=SCHEDULE,
+        ),
+    ] = None,
     seed: Annotated[
         int | None, typer.Option(help="The same seed gives the same result.", rich_help_panel=SCHEDULE)
     ] = None,
@@ -105,7 +114,7 @@ def pose(
             "optimiser": {"rate": rate},
             "machine": {"devices": devices, "nodes": num_nodes, "accelerator": accelerator, "precision": precision,
                         "workers": workers, "threads": threads},
-            "stream": {"batch": batch},
+            "stream": {"batch": batch, "mvnet": mvnet},
             "sources": {"models": _texts(model), "meshes": _texts(meshes), "bop": bop or None, "init": init,
                         "backgrounds": _text(backgrounds), "flownets": _text(flownets), "units": units,
                         "validate_on": _text(validate_on)},
@@ -156,9 +165,8 @@ def _config(file: Path | None, asked: dict[str, Any], objects: bool) -> TrainCon
 
     config = read_config(file) if file is not None else default_config(asked["recipe"] or "lite")
     if file is None and config.recipe == "lite" and objects and asked["sources"]["init"] is None:
-        config = changed(
-            config, {"sources": {"init": "shipped"}, "optimiser": {"rate": 2e-4, "warmup": 100}}, "defaults"
-        )
+        start = {"sources": {"init": "shipped"}, "optimiser": {"rate": 2e-4, "warmup": 100}, "stream": {"mvnet": 0}}
+        config = changed(config, start, "defaults")
     if asked["sources"]["init"] == "none":
         asked["sources"]["init"] = ""
     if asked["minutes"] is not None and asked["steps"] is None:
