@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -130,13 +129,20 @@ def test_poses_beside_a_known_one_compete_with_it(examples) -> None:
         assert np.isclose(np.rad2deg(turn), 12)
         np.testing.assert_allclose(pose.apply(centre), example.T_cam_obj.apply(centre), atol=1e-9)
     assert len({tuple(np.round(pose.R.ravel(), 6)) for pose in around}) == 4
-    far = poses_beside(example.T_cam_obj, example.model, np.deg2rad(30))[0]
-    asked = EstimateOptions(iterations=4, stop_angle_deg=0.01)  # nothing converges
-    both, alone = (
-        PoseEstimator(example.model, options=replace(asked, beside=beside)).refine(example.view, far)
-        for beside in (True, False)
-    )
-    assert both.iterations == alone.iterations == 4 and both.score >= alone.score
+
+
+@pytest.mark.parametrize(("stop_angle", "beside", "tried"), [(0.01, True, [1, 4]), (180, True, [1]), (0.01, False, [])])
+def test_poses_beside_are_tried_where_the_given_one_does_not_converge(
+    stop_angle: float, beside: bool, tried: list[int], examples, monkeypatch: pytest.MonkeyPatch
+) -> None:  # type: ignore[no-untyped-def]
+    example, starts = examples[0], []
+    options = EstimateOptions(iterations=4, stop_angle_deg=stop_angle, beside=beside)
+    estimator = PoseEstimator(example.model, options=options)
+    heats = estimator._heats
+    monkeypatch.setattr(estimator, "_heats", lambda view, poses: starts.append(len(poses)) or heats(view, poses))
+    found = estimator.refine(example.view, poses_beside(example.T_cam_obj, example.model, np.deg2rad(20))[0])
+    assert starts == tried
+    assert found.iterations == (1 if stop_angle == 180 else 4)
 
 
 def test_the_score_prefers_small_angles_and_agreement() -> None:

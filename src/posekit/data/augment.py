@@ -206,9 +206,9 @@ def disturb_mask(mask: NDArray[np.bool_], config: AugmentConfig, rng: Rng) -> ND
         centre = [int(rng.choice(columns)), int(rng.choice(rows))]
         axes = [int(a) for a in rng.integers(5, 30, size=2)]
         cv2.ellipse(out, centre, axes, float(rng.uniform(0, 180)), 0, 360, int(rng.integers(2)), -1)
-    if rng.random() < 0.6:
+    if rng.random() < 0.45:
         out = _resize_mask(out, config, rng)
-    if rng.random() < 0.3:
+    if rng.random() < 0.2:
         noise = noise_image(rng, mask.shape[::-1], 1)[..., 0] - 0.5
         soft = cv2.GaussianBlur(out.astype(np.float32), (0, 0), float(rng.uniform(1, 3)))
         out = (soft + 0.8 * noise > 0.5).astype(np.uint8)
