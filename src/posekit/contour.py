@@ -33,11 +33,11 @@ STILL = 1e-4  # a step in radians, or in distances of the object, that ends the 
 @dataclass(frozen=True)
 class ContourConfig:
     """size: (width, height) of the crop. steps: of Gauss-Newton, each with a rendering. knee: distance in pixels of
-    the photograph at which a point loses three quarters of its weight (Geman and McClure). sigma: standard deviation of a distance.
-    together: so many neighbouring pixels of the outline err alike. turn, shift, depth: how far the given pose may be
-    off, standard deviations in radians, crop pixels, and share of the distance. grown: by how many pixels of the
-    photograph the mask may be too large or too small all round, standard deviation. near: distance beyond which the
-    mask ends for another reason, such as something in front."""
+    the photograph at which a point loses three quarters of its weight (Geman and McClure). sigma: standard deviation
+    of a distance. together: so many neighbouring pixels of the outline err alike. turn, shift, depth: how far the
+    given pose may be off, standard deviations in radians, crop pixels, and share of the distance. grown: by how many
+    pixels of the photograph the mask may be too large or too small all round, standard deviation. near: distance
+    beyond which the mask ends for another reason, such as something in front."""
 
     size: tuple[int, int] = (320, 240)
     steps: int = 10
