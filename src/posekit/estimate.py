@@ -19,7 +19,7 @@ from posekit.nets.weights import load_networks
 from posekit.object_model import ObjectModel
 from posekit.refine import Refinement, RefineOptions, refine
 from posekit.render import Renderer
-from posekit.results import Detection, Estimate, Step
+from posekit.results import Detection, Estimate
 from posekit.view import View
 
 INITS = ("templates", "mvnet")
@@ -174,9 +174,8 @@ class PoseEstimator:
         fit = fit_contour(view, self.model, refined.T_cam_obj, self.renderer)
         if fit is None or not fit.exact:
             return refined
-        trace = (*refined.trace, Step(refined.T_cam_obj, refined.angle))
         converged = fit.turn_std < self.options.refine_options.stop_angle
-        return replace(refined, T_cam_obj=fit.T_cam_obj, angle=fit.turn_std, converged=converged, trace=trace)
+        return replace(refined, T_cam_obj=fit.T_cam_obj, angle=fit.turn_std, converged=converged)
 
     def _scores(self, view: View, refined: Sequence[Refinement]) -> list[float]:
         poses = [r.T_cam_obj for r in refined]
