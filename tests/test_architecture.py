@@ -17,7 +17,7 @@ LAYERS = {
     0: {"geometry", "camera", "files"},
     1: {"view", "object_model", "results"},
     2: {"load", "zoom", "metrics", "pnp", "render", "nets", "detect", "draw"},
-    3: {"data", "refine", "hypotheses", "figures", "odometry", "video"},
+    3: {"data", "refine", "hypotheses", "figures", "odometry", "video", "contour"},
     4: {"estimate", "novel"},
     5: {"search", "track", "evaluate", "train"},
     6: {"cli"},

@@ -145,6 +145,29 @@ def test_poses_beside_are_tried_where_the_given_one_does_not_converge(
     assert found.iterations == (1 if stop_angle == 180 else 4)
 
 
+def test_an_exact_mask_finishes_the_pose(examples) -> None:
+    """With the outline nearer than without, and a rough mask leaves the network's pose."""
+    example = examples[0]
+    there, networks = (
+        PoseEstimator(example.model, options=EstimateOptions(iterations=1, contour=contour))
+        for contour in (True, False)
+    )
+    mask = masked(there.renderer, example).mask
+    assert mask is not None
+    view, start = example.view.with_mask(mask), poses_beside(example.T_cam_obj, example.model, np.deg2rad(12))[0]
+    with_it, without = there.refine(view, start), networks.refine(view, start)
+    assert with_it.iterations == without.iterations
+    turns = [pose_change(found.T_cam_obj, example.T_cam_obj)[0] for found in (with_it, without)]
+    assert turns[0] < turns[1] and np.rad2deg(turns[0]) < 1.5, np.rad2deg(turns)
+    assert 0 < with_it.angle < np.deg2rad(4)
+    box = np.zeros_like(mask)
+    x0, y0, x1, y1 = (int(edge) for edge in example.box)
+    box[y0:y1, x0:x1] = True
+    rough = example.view.with_mask(box)
+    left, right = (estimator.refine(rough, start).T_cam_obj for estimator in (there, networks))
+    np.testing.assert_array_equal(left.matrix, right.matrix)
+
+
 def test_the_score_prefers_small_angles_and_agreement() -> None:
     good = score(0.02, Agreement(0.9, 0.8))
     assert 0 < score(0.5, Agreement(0.9, 0.8)) < good < 1

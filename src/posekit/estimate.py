@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from posekit.camera import Box
+from posekit.contour import fit_contour
 from posekit.errors import ConfigError
 from posekit.geometry import Pose
 from posekit.hypotheses import Agreement, Hypothesis, MVNetSearch, TemplateSearch, agreements, poses_beside
@@ -29,7 +30,8 @@ BESIDE = float(np.deg2rad(12.0))  # how far from a known pose others are tried
 @dataclass(frozen=True)
 class EstimateOptions:
     """init: where first poses come from. hypotheses: how many of them are refined. beside: whether poses beside a known
-    one are tried too where it does not converge at once. seed: for whatever is drawn at random. The rest is
+    one are tried too where it does not converge at once. contour: whether the pose is laid onto the mask's outline
+    where the mask proves exact. seed: for whatever is drawn at random. The rest is
     RefineOptions', with the angle in degrees."""
 
     init: str = "templates"
@@ -40,6 +42,7 @@ class EstimateOptions:
     stop_angle_deg: float = 2.0
     seed: int = 0
     beside: bool = True
+    contour: bool = True
 
     def __post_init__(self) -> None:
         if self.init not in INITS:
@@ -150,7 +153,7 @@ class PoseEstimator:
         """The hypothesis with the best score: a low predicted angle, and a silhouette that agrees with the mask."""
         scores = self._scores(view, refined)
         k = int(np.argmax(scores))
-        best = refined[k]
+        best = self._on_contour(view, refined[k])
         return Estimate(
             T_cam_obj=best.T_cam_obj,
             angle=best.angle,
@@ -163,6 +166,16 @@ class PoseEstimator:
             trace=best.trace,
             timings=timings,
         )
+
+    def _on_contour(self, view: View, refined: Refinement) -> Refinement:
+        """With its outline on the mask's, where there is an exact one; the angle is then the fit's."""
+        if not self.options.contour or view.mask is None:
+            return refined
+        fit = fit_contour(view, self.model, refined.T_cam_obj, self.renderer)
+        if fit is None or not fit.exact:
+            return refined
+        converged = fit.turn_std < self.options.refine_options.stop_angle
+        return replace(refined, T_cam_obj=fit.T_cam_obj, angle=fit.turn_std, converged=converged)
 
     def _scores(self, view: View, refined: Sequence[Refinement]) -> list[float]:
         poses = [r.T_cam_obj for r in refined]

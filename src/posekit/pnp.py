@@ -56,7 +56,7 @@ def solve_pnp(
         size = np.linalg.norm(residual, axis=1)
         knee = max(config.knee, 1.5 * float(np.median(size)))
         w = visible / (1 + (size / knee) ** 2) / sigma**2
-        J = _jacobian(p, q, camera)  # (N, 2, 6)
+        J = projection_jacobian(p, q, camera)  # (N, 2, 6)
         weighted = J * w[:, None, None]
         H = np.einsum("nij,nik->jk", weighted, J)
         g = np.einsum("nij,ni->j", weighted, residual * sigma[:, None])
@@ -69,7 +69,7 @@ def solve_pnp(
     return Pose(nearest_rotation(R), t)
 
 
-def _jacobian(p: Array, q: Array, camera: Camera) -> Array:
+def projection_jacobian(p: Array, q: Array, camera: Camera) -> Array:
     """d project(exp(w) p + t) / d(w, t) at zero; p: (N, 3) rotated points, q = p + t -> (N, 2, 6)."""
     z = q[:, 2]
     d = np.zeros((len(q), 2, 3))

@@ -12,6 +12,7 @@ from posekit.cli.options import (
     LOOP,
     BoxOption,
     CameraOption,
+    ContourOption,
     DetectionsOption,
     DetectorOption,
     ForceOption,
@@ -74,6 +75,7 @@ def estimate(
     stop: StopOption = "angle",
     iterations: IterationsOption = 50,
     stop_angle: StopAngleOption = 2.0,
+    contour: ContourOption = True,
     seed: SeedOption = 0,
     threads: ThreadsOption = None,
     out: OutOption = None,
@@ -91,7 +93,7 @@ def estimate(
     from posekit.object_model import ObjectModel
     from posekit.search import SearchOptions, estimate_instances
 
-    options = EstimateOptions(init, hypotheses, update, stop, iterations, stop_angle, seed)
+    options = EstimateOptions(init, hypotheses, update, stop, iterations, stop_angle, seed, contour=contour)
     view = load_view(image, camera)
     meshes = [ObjectModel.load(path, units=units, symmetry=symmetry) for path in model]
     finder = prompt_for(box, mask, mask_from, detections, image)

@@ -87,6 +87,14 @@ BesideOption = Annotated[
         rich_help_panel=LOOP,
     ),
 ]
+ContourOption = Annotated[
+    bool,
+    typer.Option(
+        "--contour/--no-contour",
+        help="Lay the final outline onto the mask's, where the mask proves exact to the pixel.",
+        rich_help_panel=LOOP,
+    ),
+]
 SeedOption = Annotated[int, typer.Option(help="The same seed gives the same result.", rich_help_panel=LOOP)]
 ThreadsOption = Annotated[
     int | None, typer.Option(min=1, help="Threads of torch; by default its own choice.", rich_help_panel=LOOP)

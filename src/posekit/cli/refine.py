@@ -12,6 +12,7 @@ from posekit.cli.options import (
     BesideOption,
     BoxOption,
     CameraOption,
+    ContourOption,
     ForceOption,
     ImageArgument,
     IterationsOption,
@@ -54,6 +55,7 @@ def refine(
     iterations: IterationsOption = 50,
     stop_angle: StopAngleOption = 2.0,
     beside: BesideOption = True,
+    contour: ContourOption = True,
     seed: SeedOption = 0,
     threads: ThreadsOption = None,
     out: OutOption = None,
@@ -71,7 +73,13 @@ def refine(
     from posekit.object_model import ObjectModel
 
     options = EstimateOptions(
-        update=update, stop=stop, iterations=iterations, stop_angle_deg=stop_angle, seed=seed, beside=beside
+        update=update,
+        stop=stop,
+        iterations=iterations,
+        stop_angle_deg=stop_angle,
+        seed=seed,
+        beside=beside,
+        contour=contour,
     )
     start = load_pose(pose)
     view = load_view(image, camera)
