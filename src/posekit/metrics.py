@@ -68,20 +68,25 @@ def within(rotation: ArrayLike, translation: ArrayLike, degrees: float, centimet
 def add(estimated: Poses, truth: Poses, points: ArrayLike) -> Array:
     """ADD: the mean distance of corresponding points, metres. points: (P, 3) of the model, metres."""
     est, gt = np.broadcast_arrays(_matrices(estimated), _matrices(truth))
-    return _by_chunk(lambda e, g: _separations(_apart(e, g), points).mean(axis=-1), len(np.asarray(points)), est, gt)
+    cloud = _columns(points)
+    return _by_chunk(lambda e, g: np.sqrt(_squares(_mapped(e - g, cloud))).mean(axis=-1), cloud.shape[1], est, gt)
 
 
 def adds(estimated: Poses, truth: Poses, points: ArrayLike) -> Array:
     """ADD-S (ADI): the mean distance from each true point to the nearest estimated one, metres.
 
     A rigid motion keeps distances: the true points are brought into the estimated object's frame, whose points then
-    need one search tree for all poses.
+    need one search tree for all poses. Points that coincide (along the seams of a texture) are searched for once, and
+    in the tree's order, so that one search finds the caches as the last one left them.
     """
-    cloud = np.asarray(points, dtype=np.float64)
+    cloud, count = np.unique(np.asarray(points, dtype=np.float64), axis=0, return_counts=True)
+    order = cKDTree(cloud, leafsize=32).indices
+    cloud, count = cloud[order], count[order]
     tree = cKDTree(cloud, leafsize=32)
     est, gt = np.broadcast_arrays(_matrices(estimated), _matrices(truth))
     between = _inverse(est) @ gt
-    return _by_chunk(lambda T: tree.query(_moved(T, cloud), workers=-1)[0].mean(axis=-1), len(cloud), between)
+    share = count / count.sum()
+    return _by_chunk(lambda T: tree.query(_moved(T, cloud), workers=-1)[0] @ share, len(cloud), between)
 
 
 def auc(errors: ArrayLike, limit: float = 0.1) -> Array:
@@ -95,11 +100,12 @@ def auc(errors: ArrayLike, limit: float = 0.1) -> Array:
 def proj2d(estimated: Poses, truth: Poses, camera: Cameras, points: ArrayLike) -> Array:
     """The mean distance of corresponding points in the picture, pixels."""
     est, gt, K = _with_cameras(estimated, truth, camera)
+    cloud = _columns(points)
 
     def mean(e: Array, g: Array, k: Array) -> Array:
-        return _distances(_projected(e, k, points), _projected(g, k, points)).mean(axis=-1)
+        return np.sqrt(_squares(_projected(e, k, cloud) - _projected(g, k, cloud))).mean(axis=-1)
 
-    return _by_chunk(mean, len(np.asarray(points)), est, gt, K)
+    return _by_chunk(mean, cloud.shape[1], est, gt, K)
 
 
 def mssd(estimated: Poses, truth: Poses, points: ArrayLike, symmetries: Sequence[Pose] = _ALONE) -> Array:
@@ -109,50 +115,23 @@ def mssd(estimated: Poses, truth: Poses, points: ArrayLike, symmetries: Sequence
     the distance is a convex function of the point.
     """
     est, gt = np.broadcast_arrays(_matrices(estimated), _matrices(truth))
-    S = _matrices(symmetries)
 
-    def least(e: Array, g: Array) -> Array:
-        return _separations(_apart(e[:, None], g[:, None] @ S), points).max(axis=-1).min(axis=-1)
+    def largest(cloud: Array, e: Array, g: Array) -> Array:
+        return _squares(_mapped(e - g, cloud)).max(axis=-1)
 
-    return _by_chunk(least, len(np.asarray(points)) * len(S), est, gt)
+    return _least(largest, symmetries, points, est, gt)
 
 
 def mspd(
     estimated: Poses, truth: Poses, camera: Cameras, points: ArrayLike, symmetries: Sequence[Pose] = _ALONE
 ) -> Array:
-    """BOP's maximum symmetry-aware projection distance, pixels. points: (P, 3), all vertices.
-
-    Many symmetries are searched by bounds: over a few extreme points the largest distance is at most that over all,
-    so a symmetry whose bound is above the best result so far need not be looked at. The result is exact.
-    """
+    """BOP's maximum symmetry-aware projection distance, pixels. points: (P, 3), all vertices."""
     est, gt, K = _with_cameras(estimated, truth, camera)
-    cloud, S = np.asarray(points, dtype=np.float64), _matrices(symmetries)
-    few = cloud[_extremes(cloud)]
 
-    def full(e: Array, g: Array, k: Array) -> Array:
-        return _distances(_projected(e, k, cloud), _projected(g, k, cloud)).max(axis=-1)
+    def largest(cloud: Array, e: Array, g: Array, k: Array) -> Array:
+        return _squares(_projected(e, k, cloud) - _projected(g, k, cloud)).max(axis=-1)
 
-    def bounds(e: Array, g: Array, k: Array) -> Array:
-        there = _projected(g[:, None] @ S, k[:, None], few)
-        return _distances(_projected(e, k, few)[:, None], there).max(axis=-1)
-
-    if len(S) == 1:
-        return _by_chunk(lambda e, g, k: full(e, g @ S[0], k), len(cloud), est, gt, K)
-
-    def least(e: Array, g: Array, k: Array) -> Array:
-        bound = bounds(e, g, k)
-        order = bound.argsort(axis=1)
-        best = np.full(len(e), np.inf)
-        for rank in range(len(S)):
-            nth = order[:, rank]
-            open_ = np.flatnonzero(np.take_along_axis(bound, nth[:, None], axis=1)[:, 0] < best)
-            if not open_.size:
-                break
-            found = full(e[open_], g[open_] @ S[nth[open_]], k[open_])
-            best[open_] = np.minimum(best[open_], found)
-        return best
-
-    return _by_chunk(least, max(len(cloud), len(few) * len(S)), est, gt, K)
+    return _least(largest, symmetries, points, est, gt, K)
 
 
 def vsd(
@@ -287,22 +266,57 @@ def _inverse(T: Array) -> Array:
     return out
 
 
-def _apart(est: Array, gt: Array) -> Array:
-    """(..., 3, 4) A with ``A @ (p, 1)`` the vector from a point's true to its estimated place."""
-    return np.asarray((est - gt)[..., :3, :])
+def _least(largest: Callable[..., Array], symmetries: Sequence[Pose], points: ArrayLike, *arrays: Array) -> Array:
+    """The least over the symmetries of the largest distance over the points.
+
+    largest: from points (4, P), estimates, truths and what else is in ``arrays`` to the square of that distance. Many
+    symmetries are searched by bounds: over a few extreme points the largest distance is at most that over all, so a
+    symmetry whose bound is above the best result so far need not be looked at. The result is exact.
+    """
+    S, cloud = _matrices(symmetries), _columns(points)
+    few = cloud[:, _extremes(cloud[:3].T)]
+
+    def least(e: Array, g: Array, *rest: Array) -> Array:
+        bound = largest(few, e[:, None], g[:, None] @ S, *(r[:, None] for r in rest))
+        order = bound.argsort(axis=1)
+        best = np.full(len(e), np.inf)
+        for nth in order.T:
+            left = np.flatnonzero(bound[np.arange(len(e)), nth] < best)
+            if not left.size:
+                break
+            found = largest(cloud, e[left], g[left] @ S[nth[left]], *(r[left] for r in rest))
+            best[left] = np.minimum(best[left], found)
+        return np.sqrt(best)
+
+    if len(S) == 1:
+        return _by_chunk(lambda e, g, *rest: np.sqrt(largest(cloud, e, g @ S[0], *rest)), cloud.shape[1], *arrays)
+    return _by_chunk(least, max(cloud.shape[1], few.shape[1] * len(S)), *arrays)
 
 
-def _separations(apart: Array, points: ArrayLike) -> Array:
-    """The length of ``A @ (p, 1)`` for all A (..., 3, 4) and points (P, 3), (..., P)."""
+def _columns(points: ArrayLike) -> Array:
+    """Points (P, 3) as homogeneous columns (4, P)."""
     cloud = np.asarray(points, dtype=np.float64)
-    vectors = cloud @ np.swapaxes(apart[..., :3], -1, -2) + apart[..., None, :, 3]
-    return np.asarray(np.sqrt(np.einsum("...i,...i->...", vectors, vectors)))
+    return np.vstack([cloud.T, np.ones(len(cloud))])
 
 
-def _projected(T: Array, K: Array, points: ArrayLike) -> Array:
-    """Pixels (..., P, 2) of points (P, 3) at poses (..., 4, 4) in cameras (..., 3, 3)."""
-    image = _moved(K @ T[..., :3, :], points)
-    return np.asarray(image[..., :2] / image[..., 2:])
+def _mapped(T: Array, columns: Array) -> Array:
+    """The first three rows of ``T @ columns`` for all T (..., 3 or 4, 4), (..., 3, P); one product for all."""
+    rows = T[..., :3, :]
+    return np.asarray((rows.reshape(-1, 4) @ columns).reshape(*rows.shape[:-1], -1))
+
+
+def _squares(vectors: Array) -> Array:
+    """Squared lengths of vectors (..., D, P), (..., P)."""
+    total = np.square(vectors[..., 0, :])
+    for k in range(1, vectors.shape[-2]):
+        total += np.square(vectors[..., k, :])
+    return np.asarray(total)
+
+
+def _projected(T: Array, K: Array, columns: Array) -> Array:
+    """Pixels (..., 2, P) of homogeneous points (4, P) at poses (..., 4, 4) in cameras (..., 3, 3)."""
+    image = _mapped(K @ T[..., :3, :], columns)
+    return np.asarray(image[..., :2, :] / image[..., 2:, :])
 
 
 def _with_cameras(estimated: Poses, truth: Poses, camera: Cameras) -> tuple[Array, Array, Array]:
@@ -333,7 +347,3 @@ def _moved(poses: Poses, points: ArrayLike) -> Array:
     T = poses if isinstance(poses, np.ndarray) else _matrices(poses)
     moved = np.asarray(points, dtype=np.float64) @ np.swapaxes(T[..., :3, :3], -1, -2)
     return np.asarray(moved + T[..., None, :3, 3])
-
-
-def _distances(a: Array, b: Array) -> Array:
-    return np.asarray(np.linalg.norm(a - b, axis=-1))

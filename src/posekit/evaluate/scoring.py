@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -92,14 +92,34 @@ def score(
 
 
 @dataclass(frozen=True, eq=False)
+class _Block:
+    """A picture's cases and guesses (their positions; guesses by falling score), and where its pairs begin: each guess
+    with each case, guess by guess."""
+
+    cases: list[int]
+    guesses: list[int]
+    start: int
+
+    def of(self, of_pairs: NDArray[Any]) -> NDArray[Any]:
+        """Its part of what there is for each pair, (guesses, cases)."""
+        shape = len(self.guesses), len(self.cases)
+        return of_pairs[self.start : self.start + shape[0] * shape[1]].reshape(shape)
+
+
+@dataclass(frozen=True, eq=False)
 class _Group:
-    """One object's cases and guesses. blocks: by picture, the positions of its cases and of its guesses, these by
-    falling score. pairs: (P, 2), guess and case; starts: where each block's pairs begin, guess by guess."""
+    """One object's cases and guesses. blocks: by picture, those that need matching. single: (S, 3), guess, case and
+    pair of the pictures with one of each. pairs: (P, 2), guess and case. order: the guesses by picture. counted: (C,),
+    of the cases."""
 
     obj_id: int
     cases: list[Case]
     guesses: list[Guess]
-    blocks: list[tuple[list[int], list[int]]]
+    blocks: list[_Block]
+    single: NDArray[np.int64]
+    pairs: NDArray[np.int64]
+    order: NDArray[np.int64]
+    counted: NDArray[np.bool_]
 
     @classmethod
     def collect(cls, obj_id: int, cases: Sequence[Case], guesses: Sequence[Guess]) -> _Group:
@@ -110,22 +130,45 @@ class _Group:
         here = [g for g in guesses if g.obj_id == obj_id]
         for k, guess in enumerate(here):  # those in pictures without the object count for the precision
             by_picture.setdefault((guess.scene, guess.image), ([], []))[1].append(k)
-        blocks = [(cs, sorted(gs, key=lambda g: -here[g].score)) for cs, gs in by_picture.values()]
-        return cls(obj_id, mine, here, blocks)
+        blocks: list[_Block] = []
+        single: list[tuple[int, int, int]] = []
+        pairs: list[tuple[int, int]] = []
+        order: list[int] = []
+        for cs, unsorted in by_picture.values():
+            gs = sorted(unsorted, key=lambda g: -here[g].score)
+            if len(cs) == len(gs) == 1:
+                single.append((gs[0], cs[0], len(pairs)))
+            else:
+                blocks.append(_Block(cs, gs, len(pairs)))
+            pairs += [(g, c) for g in gs for c in cs]
+            order += gs
+        return cls(
+            obj_id,
+            mine,
+            here,
+            blocks,
+            np.array(single, dtype=np.int64).reshape(-1, 3),
+            np.array(pairs, dtype=np.int64).reshape(-1, 2),
+            np.array(order, dtype=np.int64),
+            np.array([case.counted for case in mine], dtype=np.bool_),
+        )
 
-    def pairs(self) -> NDArray[np.int64]:
-        """(P, 2), all guesses against all cases of the same picture, block by block, guess by guess."""
-        return np.array([(g, c) for cs, gs in self.blocks for g in gs for c in cs], dtype=np.int64).reshape(-1, 2)
+    def asked(self, block: _Block) -> list[int]:
+        """Which of a picture's cases are counted, as positions among them."""
+        return [k for k, c in enumerate(block.cases) if self.counted[c]]
+
+    def scores(self, guesses: Sequence[int]) -> list[float]:
+        return [self.guesses[g].score for g in guesses]
 
 
 def _score_object(group: _Group, measured: MeasuredModel, info: DatasetInfo, vsd: VsdErrors | None) -> Scored:
-    model, pairs = measured.model, group.pairs()
+    model = measured.model
     symmetries = model.symmetries.transforms(metrics.BOP_STEPS)
     est = np.array([g.T_cam_obj.matrix for g in group.guesses]).reshape(-1, 4, 4)
     gt = np.array([c.T_cam_obj.matrix for c in group.cases]).reshape(-1, 4, 4)
     K = np.array([c.K for c in group.cases]).reshape(-1, 3, 3)
     scale = np.array([640.0 / c.width for c in group.cases])
-    g, c = pairs.T
+    g, c = group.pairs.T
     vertices = model.vertices.astype(np.float64)
     surface = metrics.mssd(est[g], gt[c], model.outline, symmetries) / measured.diameter
     pixels = metrics.mspd(est[g], gt[c], K[c], vertices, symmetries) * scale[c]
@@ -139,7 +182,7 @@ def _score_object(group: _Group, measured: MeasuredModel, info: DatasetInfo, vsd
         hits["ar"] = (hits["vsd_ar"] + hits["mssd_ar"] + hits["mspd_ar"]) / 3
     hits["ar_mssd_mspd"] = (hits["mssd_ar"] + hits["mspd_ar"]) / 2
     ap = {"mssd_ap": _precision(group, surface, SHARES), "mspd_ap": _precision(group, pixels, PIXELS)}
-    counted = np.array([case.counted for case in group.cases], dtype=np.bool_)
+    counted = group.counted
     return Scored(
         [case for case in group.cases if case.counted],
         [group.guesses[f] if f >= 0 else None for f in found[counted]],
@@ -210,89 +253,95 @@ def _hits(errors: Mapping[str, Array], diameter: float) -> dict[str, Array]:
     return hits
 
 
-def _block_errors(group: _Group, pair_errors: Array) -> Iterable[tuple[list[int], list[int], Array]]:
-    """Each picture's cases, guesses and errors (guesses, cases)."""
-    start = 0
-    for cs, gs in group.blocks:
-        size = len(cs) * len(gs)
-        yield cs, gs, pair_errors[start : start + size].reshape(len(gs), len(cs))
-        start += size
-
-
 def _assigned(group: _Group, surface: Array) -> NDArray[np.int64]:
     """For each case the guess that is held against it, -1 where there is none."""
     found = np.full(len(group.cases), -1)
-    for cs, gs, errors in _block_errors(group, surface):
-        linked = {group.guesses[g].index: g for g in gs}
+    for g, c, _ in group.single:
+        index = group.guesses[g].index
+        if group.counted[c] if index is None else index == group.cases[c].index:
+            found[c] = g
+    for block in group.blocks:
+        linked = {group.guesses[g].index: g for g in block.guesses}
         if None not in linked:
-            for c in cs:
+            for c in block.cases:
                 found[c] = linked.get(group.cases[c].index, -1)
             continue
-        counted = [k for k, c in enumerate(cs) if group.cases[c].counted]
-        top = gs[: len(counted)]
-        matched = metrics.match(errors[: len(top)][:, counted], [group.guesses[g].score for g in top], np.inf)
+        asked = group.asked(block)
+        top = block.guesses[: len(asked)]
+        matched = metrics.match(block.of(surface)[: len(top)][:, asked], group.scores(top), np.inf)
         for g, m in zip(top, matched, strict=True):
             if m >= 0:
-                found[cs[counted[m]]] = g
+                found[block.cases[asked[m]]] = g
     return found
 
 
 def _of_assigned(group: _Group, pair_errors: Array, found: NDArray[np.int64]) -> Array:
+    """The errors of the pairs that `_assigned` made, (cases,), infinite where there is none."""
     values = np.full(len(group.cases), np.inf)
-    for cs, gs, errors in _block_errors(group, pair_errors):
-        for k, c in enumerate(cs):
-            if found[c] >= 0:
-                values[c] = errors[gs.index(int(found[c])), k]
+    g, c = group.pairs.T
+    mine = found[c] == g
+    values[c[mine]] = pair_errors[mine]
     return values
 
 
 def _recall(group: _Group, pair_errors: Array, thresholds: Array) -> Array:
     """For each case the share of the thresholds at which BOP's matching finds it."""
     found = np.zeros(len(group.cases), dtype=np.int64)
-    for cs, gs, errors in _block_errors(group, pair_errors):
-        counted = [k for k, c in enumerate(cs) if group.cases[c].counted]
-        top = errors[: len(counted)][:, counted]
-        if len(counted) == 1 and len(top):
-            found[cs[counted[0]]] = (top[0, 0] < thresholds).sum()
-            continue
-        scores = [group.guesses[g].score for g in gs[: len(counted)]]
+    _, c, pair = group.single.T
+    found[c] = (pair_errors[pair, None] < thresholds).sum(axis=1)
+    for block in group.blocks:
+        asked = group.asked(block)
+        top = block.of(pair_errors)[: len(asked)][:, asked]
+        scores = group.scores(block.guesses[: len(asked)])
         for threshold in thresholds:
             matched = metrics.match(top, scores, threshold)
             for m in matched[matched >= 0]:
-                found[cs[counted[m]]] += 1
-    return found / len(thresholds)
+                found[block.cases[asked[m]]] += 1
+    return np.where(group.counted, found / len(thresholds), 0.0)
 
 
 def _vsd_recall(group: _Group, vsd: VsdErrors) -> Array:
     """As `_recall`, averaged over the ten tolerances."""
-    errors = []
-    for cs, gs in group.blocks:
-        asked = sum(group.cases[c].counted for c in cs)
-        for rank, g in enumerate(gs):
-            for c in cs:
-                needed = rank < asked and group.cases[c].counted
-                errors.append(vsd(group.cases[c], group.guesses[g]) if needed else np.ones(len(SHARES)))
-    table = np.array(errors).reshape(-1, len(SHARES))
+    needed = np.zeros(len(group.pairs), dtype=np.bool_)
+    needed[group.single[:, 2]] = True
+    for block in group.blocks:
+        block.of(needed)[: len(group.asked(block))] = True
+    needed &= group.counted[group.pairs[:, 1]]
+    table = np.ones((len(group.pairs), len(SHARES)))
+    for k in np.flatnonzero(needed):
+        g, c = group.pairs[k]
+        table[k] = vsd(group.cases[c], group.guesses[g])
     return np.asarray(np.mean([_recall(group, table[:, k], SHARES) for k in range(len(SHARES))], axis=0))
 
 
 def _precision(group: _Group, pair_errors: Array, thresholds: Array) -> float | None:
     """BOP'24's AP of one object; None where nothing was asked for."""
-    total = sum(case.counted for case in group.cases)
+    total = int(group.counted.sum())
     if not total:
         return None
+    scores = np.array(group.scores(group.order.tolist()))
     values = []
     for threshold in thresholds:
-        hits: list[bool] = []
-        scores: list[float] = []
-        for cs, gs, errors in _block_errors(group, pair_errors):
-            best = [group.guesses[g].score for g in gs[:AP_MOST]]
-            for m, value in zip(metrics.match(errors[:AP_MOST], best, threshold), best, strict=True):
-                if m < 0 or group.cases[cs[m]].counted:  # what hits an instance that is not asked for does not count
-                    hits.append(m >= 0)
-                    scores.append(value)
-        values.append(metrics.average_precision(hits, scores, total))
+        right, used = _judged(group, pair_errors, float(threshold))
+        values.append(
+            metrics.average_precision(right[group.order][used[group.order]], scores[used[group.order]], total)
+        )
     return float(np.mean(values))
+
+
+def _judged(group: _Group, pair_errors: Array, threshold: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which guesses are right, and which count at all: not those beyond AP_MOST in a picture, nor those that hit an
+    instance which is not asked for."""
+    right, used = np.zeros(len(group.guesses), dtype=np.bool_), np.zeros(len(group.guesses), dtype=np.bool_)
+    g, c, pair = group.single.T
+    right[g] = pair_errors[pair] < threshold
+    used[g] = ~right[g] | group.counted[c]
+    for block in group.blocks:
+        best = block.guesses[:AP_MOST]
+        matched = metrics.match(block.of(pair_errors)[:AP_MOST], group.scores(best), threshold)
+        right[best] = matched >= 0
+        used[best] = [m < 0 or group.counted[block.cases[m]] for m in matched]
+    return right, used
 
 
 def _joined(parts: Sequence[Scored]) -> Scored:
