@@ -24,7 +24,8 @@ LAYERS = {
     7: {"__main__"},
 }
 ANYWHERE = {"errors", "_version"}
-SIBLINGS = {("camera", "geometry"), ("evaluate", "track")}  # a camera turns rays; tracking is measured too
+# A camera turns rays; tracking and the search for instances are measured too.
+SIBLINGS = {("camera", "geometry"), ("evaluate", "track"), ("evaluate", "search")}
 
 # A foreign library and the rooms whose door it is.
 DOORS = {

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,9 @@ from posekit.evaluate.stages import ImageStage
 from posekit.evaluate.table import novelty
 from posekit.evaluate.truths import TruthReader
 from posekit.geometry import Pose, so3_exp
+from posekit.object_model import ObjectModel
+from posekit.results import Detection
+from posekit.view import View
 
 QUICK = EstimateOptions(stop="fixed", iterations=1, hypotheses=1)
 QUICK_ARGS = ["--stop", "fixed", "--iterations", "1", "--hypotheses", "1"]
@@ -301,6 +305,56 @@ def test_estimates_from_a_detections_file(root: Path, tmp_path: Path) -> None:
     assert found["detection_score"] == 0.9
 
 
+def test_objects_by_name(root: Path, tmp_path: Path) -> None:
+    named = write_scene(tmp_path / "named", images=1)
+    first, *others = BopDataset(named).model_ids()
+    (named / "objects.json").write_text(json.dumps({str(first): "Left_hand bracket", "99": "elsewhere"}))
+    out = tmp_path / "out"
+    done = run("--stage", "refine", "--root", named, "--objects", "left hand bracket", "--out", out, *QUICK_ARGS)
+    assert done.exit_code == 0, done.output
+    assert f"{first} Left_hand bracket" in done.output
+    assert set(json.loads((out / "results.json").read_text())["per_object"]) == {str(first)} and others
+    wrong = run("--stage", "refine", "--root", named, "--objects", "elsewhere", "--out", out)
+    assert wrong.exit_code == 1 and "it has" in wrong.output and "Left_hand bracket" in wrong.output
+    assert run("--stage", "refine", "--root", root, "--objects", "ape").exit_code == 1
+    (named / "objects.json").write_text("[]")
+    broken = run("--stage", "refine", "--root", named, "--out", tmp_path / "b")
+    assert broken.exit_code == 1 and "objects.json" in broken.output
+
+
+def test_estimates_from_a_detector(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that knows the masks of half of the objects, and sees one where there is none."""
+    data = BopDataset(root)
+    truth = TruthReader(data).read(2, 0)[0]
+    mask, box = truth.read_mask(), truth.box_visib
+    assert box is not None
+    away = np.zeros_like(mask)
+    away[:40, -40:] = True
+    name = data.model(truth.instance.obj_id).name
+    asked: list[tuple[str, int]] = []
+
+    class Oracle:
+        def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
+            assert [m.name for m in models] == [data.model(k).name for k in data.model_ids()]
+            width = view.camera.width
+            return [Detection(box, mask, 0.9, name), Detection((width - 40, 0, width, 40), away, 0.5, name)]
+
+    def make(detector: str, models: Sequence[ObjectModel], **_: Any) -> tuple[Oracle, tuple[str, ...]]:
+        asked.append((detector, len(models)))
+        return Oracle(), ()
+
+    monkeypatch.setattr("posekit.evaluate.stages.make_detector", make)
+    options = EvalOptions(
+        "estimate", root=root, images=((2, 0),), detections="detector", detector="mine", estimate=QUICK
+    )
+    results = evaluate(options, tmp_path / "out").results
+    assert asked == [("mine", len(data.model_ids()))]
+    assert results["detection_ap"] == {"coco_box_ap": 50.0, "coco_mask_ap": 50.0}
+    assert results["counts"]["instances"] == 2 and results["counts"]["missing"] >= 1
+    found = [e for e in results["instances"] if e["found"]]
+    assert {e["obj_id"] for e in found} <= {truth.instance.obj_id} and all(e["detection_score"] == 0.9 for e in found)
+
+
 # --- the command, workers, interruption ------------------------------------------------------------------------------
 
 
@@ -401,7 +455,7 @@ def test_another_run_is_not_overwritten(alone: Path, root: Path, tmp_path: Path)
         (["--dataset", "lmoo"], "Did you mean lmo?"),
         (["--stage", "score", "--root", "ROOT"], "what is to be scored? Pass --csv FILE"),
         (["--root", "ROOT", "--objects", "7"], "the data set has no objects [7]; there are [1, 2]"),
-        (["--root", "ROOT", "--objects", "ape"], "give numbers separated by commas"),
+        (["--root", "ROOT", "--objects", "ape"], "has no object 'ape'; it has numbers only"),
         (["--root", "ROOT", "--images", "2-3"], "give a number, or SCENE/IMAGE pairs"),
         (["--root", "ROOT", "--images", "9/9"], "no picture of small is left"),
         (["--root", "ROOT", "--noise", "1,2"], "give four numbers"),

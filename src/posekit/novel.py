@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from weakref import WeakKeyDictionary
 
 import cv2
@@ -18,8 +19,9 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 
 from posekit.camera import Camera
+from posekit.detect import Detector
 from posekit.detect.backbones import Lite0
-from posekit.detect.maskrcnn import TrainedDetector, find
+from posekit.detect.maskrcnn import COCO, SHIPPED, MaskRCNN, TrainedDetector, find, load_coco, load_detector
 from posekit.errors import ConfigError
 from posekit.geometry import Pose, fibonacci_sphere, view_rotation
 from posekit.hypotheses import TemplateSearch
@@ -31,6 +33,7 @@ from posekit.zoom import zoom_to_box
 
 FArray = NDArray[np.float32]
 
+ANY = "novel"  # the name of the shipped detector
 SIDE = 96  # pixels of the pictures whose features are compared
 LEVEL, STRIDE = "3", 32  # of the backbone's features
 MARGIN = 1.1
@@ -175,3 +178,27 @@ def _overlap(a: Detection, b: Detection) -> float:
     """Intersection over union of two masks."""
     assert a.mask is not None and b.mask is not None
     return float((a.mask & b.mask).sum() / max(1, (a.mask | b.mask).sum()))
+
+
+def make_detector(
+    name: str | None,
+    models: Sequence[ObjectModel],
+    *,
+    least: float | None = None,
+    most: int = 3,
+    threads: int | None = None,
+) -> tuple[Detector, tuple[str, ...]]:
+    """A network's Detector and the names that its detections may have. name: "novel" (the default), "coco", or a
+    trained detector's file or folder. Raises WeightsError, ConfigError."""
+    if threads is not None:
+        torch.set_num_threads(threads)
+    file = SHIPPED if name is None or name == ANY else Path(name)
+    trained = load_coco() if name == COCO else load_detector(file)
+    if not trained.config.novel:
+        names = tuple(m.name for m in models) or trained.config.classes
+        return MaskRCNN(trained, 0.5 if least is None else least), names
+
+    options = NovelOptions(most=most) if least is None else NovelOptions(least=least, least_proposal=least, most=most)
+    if models and least is not None:
+        options = NovelOptions(least=least, most=most)
+    return NovelDetector(trained, Renderer(), options), tuple(m.name for m in models) or trained.config.classes

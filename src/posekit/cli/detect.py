@@ -52,12 +52,12 @@ def detect(
 ) -> None:
     """Find objects in a photograph: boxes, masks and scores, as COCO and BOP JSON."""
     from posekit.cli.output import OutputFolder
-    from posekit.cli.prompts import make_detector
     from posekit.detect.external import to_bop, to_coco
     from posekit.draw import png
     from posekit.errors import ConfigError
     from posekit.figures import detections_overlay
     from posekit.load import load_view
+    from posekit.novel import make_detector
     from posekit.object_model import ObjectModel
 
     if weights is not None and detector is not None:

@@ -87,7 +87,7 @@ def estimate(
 
     destination = Destination.chosen(out, Path("posekit-out") / image.stem, force, json)
 
-    from posekit.cli.prompts import make_detector, prompt_for
+    from posekit.cli.prompts import prompt_for
     from posekit.estimate import EstimateOptions, PoseEstimator
     from posekit.load import load_view
     from posekit.object_model import ObjectModel
@@ -99,6 +99,8 @@ def estimate(
     finder = prompt_for(box, mask, mask_from, detections, image)
     asked = finder is not None
     if finder is None:
+        from posekit.novel import make_detector
+
         with destination.working("loading the detector"):
             finder, _ = make_detector(detector, meshes, most=max(CANDIDATES, instances + 1), threads=threads)
     with destination.working("detecting"):

@@ -47,7 +47,7 @@ def evaluate(
     ] = None,
     split: Annotated[str | None, typer.Option(help="Folder with the scenes.", rich_help_panel=DATA)] = None,
     objects: Annotated[
-        str | None, typer.Option(metavar="1,9,...", help="Only these objects.", rich_help_panel=DATA)
+        str | None, typer.Option(metavar="1,9|ape,duck", help="Only these objects.", rich_help_panel=DATA)
     ] = None,
     images: Annotated[
         str | None,
@@ -61,8 +61,13 @@ def evaluate(
     ] = None,
     detections: Annotated[
         str,
-        typer.Option(metavar="gt-boxes|gt-masks|FILE.json", help="What estimate starts from.", rich_help_panel=STAGE),
+        typer.Option(
+            metavar="gt-boxes|gt-masks|detector|FILE.json", help="What estimate starts from.", rich_help_panel=STAGE
+        ),
     ] = "gt-masks",
+    detector: Annotated[
+        str, typer.Option(metavar="novel|FILE", help="With --detections detector: which.", rich_help_panel=STAGE)
+    ] = "novel",
     masks: Annotated[
         Literal["true", "none"], typer.Option(help="What refine knows of the silhouette.", rich_help_panel=STAGE)
     ] = "true",
@@ -120,11 +125,12 @@ def evaluate(
         dataset=dataset,
         root=root,
         split=split,
-        objects=_objects(objects),
+        objects=_objects(objects, dataset, root, split),
         images=chosen,
         limit=limit,
         min_visible=min_visible,
         detections=detections,
+        detector=detector,
         masks=masks,
         noise=_noise(noise),
         preset=preset,
@@ -149,13 +155,17 @@ def _command() -> str:
     return shlex.join(["posekit", *sys.argv[1:]])
 
 
-def _objects(text: str | None) -> tuple[int, ...]:
-    from posekit.errors import ConfigError
+def _objects(text: str | None, dataset: str | None, root: Path | None, split: str | None) -> tuple[int, ...]:
+    """Numbers, or names as the data set has them."""
+    if not text:
+        return ()
+    parts = [part.strip() for part in text.split(",")]
+    if all(part.isdigit() for part in parts):
+        return tuple(int(part) for part in parts)
+    from posekit.data.datasets import open_dataset
 
-    try:
-        return tuple(int(part) for part in text.split(",")) if text else ()
-    except ValueError as error:
-        raise ConfigError(f"--objects {text}: give numbers separated by commas, such as 1,9.") from error
+    _, info = open_dataset(dataset, root, split)
+    return tuple(int(part) if part.isdigit() else info.number(part) for part in parts)
 
 
 def _images(text: str | None) -> tuple[int | None, tuple[tuple[int, int], ...]]:

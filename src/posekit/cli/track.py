@@ -104,7 +104,7 @@ def track(
         sequence = LatestFrames(sequence)
     finder = None
     if not pose or detector is not None:
-        from posekit.cli.prompts import make_detector
+        from posekit.novel import make_detector
 
         finder, _ = make_detector(detector, meshes, threads=threads)
     chosen = EstimateOptions(update="correspondence" if preset == "lite" else "regression")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import json
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,6 +11,8 @@ from pathlib import Path
 from posekit.data.bop import BopDataset
 from posekit.data.linemod import CLASSES, DeepimDataset, LinemodDataset, is_deepim
 from posekit.errors import ConfigError, InputError
+
+NAMES = "objects.json"  # of synthetic data sets: names by number
 
 Dataset = BopDataset | LinemodDataset | DeepimDataset
 
@@ -38,6 +41,18 @@ class DatasetInfo:
 
     def label(self, obj_id: int) -> str:
         return self.names.get(obj_id, f"object {obj_id}")
+
+    def number(self, name: str) -> int:
+        """Of the object of this name. Raises ConfigError."""
+        numbers = {_plain(known): obj_id for obj_id, known in self.names.items() if obj_id in self.objects}
+        if _plain(name) not in numbers:
+            known = ", ".join(f"{k} {v}" for k, v in self.names.items() if k in self.objects) or "numbers only"
+            raise ConfigError(f"{self.title} has no object {name!r}; it has {known}.")
+        return numbers[_plain(name)]
+
+
+def _plain(name: str) -> str:
+    return name.lower().replace("_", " ").strip()
 
 
 _LM = {1: "ape", 2: "benchvise", 3: "bowl", 4: "cam", 5: "can", 6: "cat", 7: "cup", 8: "driller", 9: "duck",
@@ -126,6 +141,17 @@ def find_root(info: DatasetInfo, root: Path | None) -> Path:
     )
 
 
+def own_names(root: Path) -> dict[int, str]:
+    """The names of a synthetic data set's objects, by number; empty where it tells none. Raises InputError."""
+    path = root / NAMES
+    if not path.is_file():
+        return {}
+    try:
+        return {int(number): str(name) for number, name in json.loads(path.read_text(encoding="utf-8")).items()}
+    except (OSError, ValueError, AttributeError) as error:
+        raise InputError(f"{path} cannot be read ({error}): it holds the objects' names by number.") from error
+
+
 def open_dataset(name: str | None, root: Path | None, split: str | None = None) -> tuple[Dataset, DatasetInfo]:
     """A data set by its name, its folder, or both. Raises ConfigError, InputError.
 
@@ -138,7 +164,7 @@ def open_dataset(name: str | None, root: Path | None, split: str | None = None) 
         known = DATASETS.get(root.resolve().name)
         if known is None or not (root / (split or known.split)).is_dir():
             data = BopDataset(root, split or "test")
-            return data, DatasetInfo(data.name, data.name, tuple(data.model_ids()))
+            return data, DatasetInfo(data.name, data.name, tuple(data.model_ids()), own_names(root))
         name = known.name
     info = dataset_info(name)
     folder = find_root(info, root)

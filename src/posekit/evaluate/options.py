@@ -12,7 +12,8 @@ from posekit.estimate import EstimateOptions
 from posekit.geometry import PoseNoise
 
 STAGES = ("refine", "estimate", "track", "score")
-DETECTIONS = ("gt-boxes", "gt-masks")
+GIVEN = ("gt-boxes", "gt-masks")  # detections that the truth gives
+DETECTOR = "detector"
 MASKS = ("true", "none")
 NOT_RESULTS = ("workers",)  # what may differ between two runs of the same results
 
@@ -21,7 +22,8 @@ NOT_RESULTS = ("workers",)  # what may differ between two runs of the same resul
 class EvalOptions:
     """dataset: a known name, or None. root: its folder. objects: numbers, all where empty. images: (scene, image),
     all where empty. limit: that many pictures, spread evenly. min_visible: instances at least as visible, in [0, 1];
-    None is the test's own targets. detections: one of DETECTIONS or a JSON file. masks: whether the refiner is given
+    None is the test's own targets. detections: one of GIVEN, DETECTOR or a JSON file. detector: which one, a name or
+    file of weights, as `novel.make_detector` takes it. masks: whether the refiner is given
     the visible mask. noise: degrees and three cm, standard deviations. threads: of torch, in each worker; the same
     whatever the number of workers, since sums depend on it. The rest is EstimateOptions'."""
 
@@ -34,6 +36,7 @@ class EvalOptions:
     limit: int | None = None
     min_visible: float | None = None
     detections: str = "gt-masks"
+    detector: str = "novel"
     masks: str = "true"
     noise: tuple[float, float, float, float] = (15.0, 1.0, 1.0, 5.0)
     preset: str = "lite"
@@ -57,9 +60,9 @@ class EvalOptions:
             raise ConfigError(f"at least 1 worker and 1 thread are needed, not {self.workers} and {self.threads}.")
         if len(self.noise) != 4 or min(self.noise) < 0:
             raise ConfigError(f"the noise is four numbers from 0 on, degrees and x, y, z in cm, not {self.noise}.")
-        if self.detections not in DETECTIONS and not Path(self.detections).is_file():
+        if self.detections not in (*GIVEN, DETECTOR) and not Path(self.detections).is_file():
             raise ConfigError(
-                f"detections are {', '.join(DETECTIONS)} or a JSON file; there is no file {self.detections!r}."
+                f"detections are {', '.join((*GIVEN, DETECTOR))} or a JSON file; there is no file {self.detections!r}."
             )
 
     @property

@@ -16,17 +16,20 @@ from numpy.typing import NDArray
 
 from posekit.camera import mask_box
 from posekit.data.datasets import open_dataset
-from posekit.detect import BoxPrompt
+from posekit.detect import BoxPrompt, Detector
 from posekit.detect.prompts import clip_box
+from posekit.detect.segmentation import encode
 from posekit.errors import ConfigError, PromptError
 from posekit.estimate import PoseEstimator
 from posekit.evaluate.bop_results import FoundRegion, read_detections
-from posekit.evaluate.options import DETECTIONS, EvalOptions
+from posekit.evaluate.options import DETECTOR, GIVEN, EvalOptions
 from posekit.evaluate.tracking import Sequences
 from posekit.evaluate.truths import Truth, TruthReader, selected
 from posekit.geometry import Pose
 from posekit.metrics import box_iou
+from posekit.novel import make_detector
 from posekit.results import Detection, Estimate
+from posekit.search import SearchOptions, estimate_instances
 from posekit.view import View
 
 Record = dict[str, Any]
@@ -43,7 +46,8 @@ class ImageStage:
         self._estimators: dict[int, PoseEstimator] = {}
         self._sequences = Sequences(self._estimator, "openvino" if options.preset == "lite" else "torch")
         self._files: Mapping[tuple[int, int], Sequence[FoundRegion]] = {}
-        if options.stage == "estimate" and options.detections not in DETECTIONS:
+        self._detector: Detector | None = None
+        if options.stage == "estimate" and options.detections not in (*GIVEN, DETECTOR):
             self._files = detections_for(self.data, options)
 
     def run(self, scene: int, image: int) -> Record:
@@ -51,8 +55,13 @@ class ImageStage:
         truths = self.truths.read(scene, image)
         chosen = selected(self.data, truths, scene, image, self.options)
         record: Record = {"scene": scene, "image": image, "truths": [_truth(t, chosen) for t in truths]}
-        wanted = chosen or (scene, image) in self._files or self.options.stage == "track"
+        detects = self.options.stage == "estimate" and self.options.detections == DETECTOR
+        wanted = chosen or (scene, image) in self._files or self.options.stage == "track" or detects
         view = self.data.view(scene, image) if wanted else None
+        if view is not None and detects:
+            record["estimates"], found = self._detected(view, scene, image)
+            record["detections"] = overlaps(found, truths)
+            return record
         record["estimates"] = [] if view is None else self._estimates(view, truths, chosen)
         if self._files:
             record["detections"] = overlaps(self._files.get((scene, image), ()), truths)
@@ -63,7 +72,7 @@ class ImageStage:
             return [self._refined(view, truth) for truth in chosen]
         if self.options.stage == "track":
             return self._tracked(view, truths, chosen)
-        if self.options.detections in DETECTIONS:
+        if self.options.detections in GIVEN:
             found = [self._from_truth(view, truth) for truth in chosen]
             return [entry for entry in found if entry is not None]
         scene, image = truths[0].instance.scene, truths[0].instance.image
@@ -115,6 +124,27 @@ class ImageStage:
                 entries.append(entry | {"score": region.score * estimate.score, "detection_score": region.score})
         return entries
 
+    def _detected(self, view: View, scene: int, image: int) -> tuple[list[Record], list[FoundRegion]]:
+        """Estimates from what the detector finds of the data set's objects, and the detections. As `posekit estimate`
+        does, only what the render bears out is kept, but any number of instances."""
+        numbers = self.options.objects or tuple(self.data.model_ids())
+        models = {obj_id: self.data.model(obj_id) for obj_id in numbers}
+        if self._detector is None:
+            self._detector, _ = make_detector(
+                self.options.detector, list(models.values()), threads=self.options.threads
+            )
+        started = time.perf_counter()
+        found = self._detector.detect(view, list(models.values()))
+        seconds = time.perf_counter() - started
+        entries, regions = [], []
+        for obj_id, model in models.items():
+            mine = [d for d in found if d.label == model.name]
+            regions += [_region(d, scene, image, obj_id, seconds) for d in mine]
+            for estimate in estimate_instances(self._estimator(obj_id), view, mine, SearchOptions(instances=0)):
+                assert estimate.detection is not None
+                entries.append(_entry(estimate, obj_id, None) | {"detection_score": estimate.detection.score})
+        return entries, regions
+
     def _estimator(self, obj_id: int) -> PoseEstimator:
         if obj_id not in self._estimators:
             o = self.options
@@ -135,6 +165,11 @@ def detections_for(data: Any, options: EvalOptions) -> dict[tuple[int, int], lis
     """A detections file, checked against the whole data set."""
     known = dict.fromkeys(data.images(), ())
     return read_detections(Path(options.detections), known, data.model_ids())
+
+
+def _region(detection: Detection, scene: int, image: int, obj_id: int, seconds: float) -> FoundRegion:
+    rle = None if detection.mask is None else encode(detection.mask)
+    return FoundRegion(scene, image, obj_id, detection.box, detection.score, rle, seconds)
 
 
 def _prompted(view: View, box: Any, estimator: PoseEstimator) -> list[Detection]:

@@ -22,6 +22,7 @@ from typing import Any
 import cv2
 
 from posekit.data.bop_writer import BopWriter, write_models
+from posekit.data.datasets import NAMES, own_names
 from posekit.data.synth.plan import CONFIG, Maker, SynthConfig
 from posekit.data.synth.report import write_report
 from posekit.data.synth.shards import write_shards
@@ -31,7 +32,6 @@ from posekit.object_model import ObjectModel
 from posekit.render import Renderer
 
 CHUNK = 8  # images that a process is given at a time, where they are made one by one
-NAMES = "objects.json"
 
 Show = Callable[[int, int], None]
 
@@ -76,7 +76,7 @@ def run(root: Path, machines: Machines, show: Show, shard: int = 0) -> int:
         show(made, config.images)
     if not complete:
         _remove_leftovers(root)
-        writer.finish(_names(root), f"posekit synth --kind {config.kind} --seed {config.seed}")
+        writer.finish(own_names(root), f"posekit synth --kind {config.kind} --seed {config.seed}")
         if config.kind == "sequence":
             from posekit.data.synth.sequence import sequences
 
@@ -209,10 +209,6 @@ def _load(root: Path) -> dict[int, ObjectModel]:
     """The data set's own copy of the models: what is drawn is what is written."""
     paths = {int(path.stem[4:]): path for path in sorted((root / "models").glob("obj_*.ply"))}
     return {obj_id: ObjectModel.load(path, units="mm") for obj_id, path in paths.items()}
-
-
-def _names(root: Path) -> dict[int, str]:
-    return {int(key): name for key, name in json.loads((root / NAMES).read_text(encoding="utf-8")).items()}
 
 
 def _write_json(path: Path, data: Any) -> None:
