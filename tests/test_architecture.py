@@ -16,16 +16,16 @@ SOURCE = Path(__file__).resolve().parent.parent / "src" / "posekit"
 LAYERS = {
     0: {"geometry", "camera", "files"},
     1: {"view", "object_model", "results"},
-    2: {"load", "zoom", "metrics", "pnp", "render", "nets", "detect", "draw"},
-    3: {"data", "refine", "hypotheses", "figures", "odometry", "video", "contour"},
+    2: {"load", "zoom", "metrics", "pnp", "fusion", "render", "nets", "detect", "draw"},
+    3: {"data", "refine", "hypotheses", "figures", "odometry", "video", "contour", "region"},
     4: {"estimate", "novel"},
     5: {"search", "track", "evaluate", "train"},
     6: {"cli"},
     7: {"__main__"},
 }
 ANYWHERE = {"errors", "_version"}
-# A camera turns rays; tracking and the search for instances are measured too.
-SIBLINGS = {("camera", "geometry"), ("evaluate", "track"), ("evaluate", "search")}
+# Fusion weighs what PnP alone solves. A camera turns rays; tracking and the search for instances are measured too.
+SIBLINGS = {("camera", "geometry"), ("fusion", "pnp"), ("evaluate", "track"), ("evaluate", "search")}
 
 # A foreign library and the rooms whose door it is.
 DOORS = {

@@ -19,10 +19,13 @@ from posekit.camera import Camera
 from posekit.cli.app import app
 from posekit.data.example import Example, make_example, ply
 from posekit.errors import CameraError, ConfigError
+from posekit.fusion import Belief, Points, fuse
 from posekit.geometry import Pose, rotation_angle, so3_exp, view_rotation
 from posekit.metrics import pose_error
 from posekit.object_model import ObjectModel
-from posekit.odometry import follow_points, look
+from posekit.odometry import Look, follow_points
+from posekit.refine import crops
+from posekit.region import learn, outline_lines
 from posekit.render import Renderer
 from posekit.results import Detection, Estimate
 from posekit.track import LOST, RESTARTED, TRACKED, TrackConfig, Tracker
@@ -31,7 +34,7 @@ from posekit.view import View
 from test_refine import Oracle
 
 CAMERA = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
-STEADY = TrackConfig(gain=1.0, still_deg=0.0)
+STEADY = TrackConfig()
 
 
 @pytest.fixture(scope="module")
@@ -97,47 +100,124 @@ def test_an_oracle_is_followed(model: ObjectModel, renderer: Renderer, motion: s
         found = following.step(photograph(renderer, model, path(model, k)).image)
         assert found.state == TRACKED and found.T_cam_obj is not None and found.estimate is not None
         turn, shift = pose_error(found.T_cam_obj, path(model, k))
-        assert np.rad2deg(turn) < 0.1 and shift < 5e-4
+        assert np.rad2deg(turn) < 0.6 and shift < 2e-3, "two degrees and 3 mm a frame"
         assert found.estimate.score > 0.8 and set(found.estimate.timings) == {"network", "total"}
+
+
+def looked(view: View, model: ObjectModel, renderer: Renderer, pose: Pose) -> Look:
+    [seen], [drawn] = crops(view, model, model.outline - model.center, [pose], (160, 120), renderer)
+    T_view_ctr = Pose.rotation(seen.R_view_cam) @ pose @ model.T_obj_ctr
+    return Look(seen, drawn, T_view_ctr, np.ones((120, 160), bool))
 
 
 def test_followed_points_alone_carry_a_pose(model: ObjectModel, renderer: Renderer) -> None:
     before, after = (photograph(renderer, model, path(model, k)) for k in (0, 1))
-    found = follow_points(look(before, path(model, 0), model, renderer), after, model)
-    assert found.pose is not None and found.share > 0.3
-    still = pose_error(path(model, 0), path(model, 1))
-    moved = pose_error(found.pose, path(model, 1))
-    assert moved[0] < 0.35 * still[0] and moved[1] < 0.35 * still[1]
-    flat = View(np.full_like(after.image, 128), CAMERA)
-    assert follow_points(look(flat, path(model, 0), model, renderer), flat, model).pose is None
-
-
-def test_the_gain_is_the_share_of_the_update(model: ObjectModel, renderer: Renderer) -> None:
-    turns = []
-    for gain in (0.0, 0.5, 1.0):
-        config = TrackConfig(gain=gain, still_deg=0.0, motion="none")
-        following = tracker(model, renderer, path(model, 2), config, pose=path(model, 0))
-        found = following.step(photograph(renderer, model, path(model, 2)).image).T_cam_obj
+    at = looked(before, model, renderer, path(model, 0))
+    # what was drawn lies beside the pose that is believed: the points are the believed pose's
+    for drawn in (at, looked(before, model, renderer, path(model, 0.3))):
+        start = Pose.rotation(drawn.seen.R_view_cam) @ path(model, 0) @ model.T_obj_ctr
+        points = follow_points(drawn, start, drawn.again(after), model)
+        assert points is not None and len(points.points) > 20
+        found = fuse(start, [Belief.about(start, drawn.drawn.camera, 1.0, 50.0, 0.5), points], drawn.drawn.camera)
         assert found is not None
-        turns.append(
-            rotation_angle(found.R @ path(model, 0).R.T) / rotation_angle(path(model, 2).R @ path(model, 0).R.T)
-        )
-    np.testing.assert_allclose(turns, [0, 0.5, 1], atol=0.02)
+        pose = Pose.rotation(drawn.seen.R_view_cam.T) @ found.pose @ model.T_obj_ctr.inverse()
+        still, moved = pose_error(path(model, 0), path(model, 1)), pose_error(pose, path(model, 1))
+        assert moved[0] < 0.35 * still[0] and moved[1] < 0.35 * still[1]
+    flat = View(np.full_like(after.image, 128), CAMERA)
+    empty = looked(flat, model, renderer, path(model, 0))
+    assert follow_points(empty, empty.T_view_ctr, empty.again(flat), model) is None
+
+
+def test_hidden_points_are_not_followed(model: ObjectModel, renderer: Renderer) -> None:
+    view = photograph(renderer, model, path(model, 0))
+    at = looked(view, model, renderer, path(model, 0))
+    left = np.arange(160) < 80
+    half = replace(at, visible=np.broadcast_to(left, (120, 160)))
+    points = follow_points(half, at.T_view_ctr, at.seen, model)
+    assert points is not None and (points.pixels[:, 0] < 81).all()
+
+
+@pytest.mark.parametrize("off", [0.0, 0.6])
+def test_an_outline_is_found_by_its_colours(model: ObjectModel, renderer: Renderer, off: float) -> None:
+    """Colours are learned at the true pose; the outline, drawn beside it, is then pulled back."""
+    view = photograph(renderer, model, path(model, 0))
+    at = looked(view, model, renderer, path(model, 0))
+    assert at.drawn.mask is not None
+    colours = learn(at.seen, at.drawn.mask, at.visible)
+    assert (colours.seen(at.seen) == at.drawn.mask).mean() > 0.9
+    beside = looked(view, model, renderer, path(model, off))
+    lines = outline_lines(beside.seen, beside.drawn, colours, colours.seen(beside.seen), model.center)
+    assert lines is not None and len(lines.points) > 60
+    np.testing.assert_allclose(np.linalg.norm(lines.normals, axis=1), 1, atol=1e-5)
+    prior = Belief.about(beside.T_view_ctr, beside.drawn.camera, 0.2, 10.0, 0.1)
+    found = fuse(beside.T_view_ctr, [prior, lines], beside.drawn.camera)
+    assert found is not None
+    pose = Pose.rotation(beside.seen.R_view_cam.T) @ found.pose @ model.T_obj_ctr.inverse()
+    turn, shift = pose_error(pose, path(model, 0))
+    assert np.rad2deg(turn) < 0.7 and shift < 0.002
+
+
+def test_an_outline_is_not_sought_where_the_object_is_hidden(model: ObjectModel, renderer: Renderer) -> None:
+    view = photograph(renderer, model, path(model, 0))
+    at = looked(view, model, renderer, path(model, 0))
+    assert at.drawn.mask is not None
+    colours = learn(at.seen, at.drawn.mask, at.visible)
+    seen = colours.seen(at.seen) & (np.arange(160) < 80)
+    lines = outline_lines(at.seen, at.drawn, colours, seen, model.center)
+    assert lines is not None and (lines.places[:, 0] < 83).all()
+    assert outline_lines(at.seen, at.drawn, colours, np.zeros_like(seen), model.center) is None
+
+
+def test_beliefs_are_weighed_by_their_information() -> None:
+    camera = Camera(200.0, 200.0, 79.5, 59.5, 160, 120)
+    a, b = Pose(np.eye(3), [0.0, 0.0, 1.0]), Pose(so3_exp([0.0, 0.02, 0.0]), [0.03, 0.0, 1.0])
+    firm, loose = (Belief.about(pose, camera, turn, 2.0, 0.05) for pose, turn in ((a, 0.01), (b, 0.02)))
+    found = fuse(a, [firm, loose], camera)
+    assert found is not None
+    assert rotation_angle(found.pose.R) == pytest.approx(0.02 / 5, rel=1e-3)  # information 4 to 1
+    assert found.pose.t[0] == pytest.approx(0.015)
+    assert found.turn_std == pytest.approx(np.sqrt(3 / (1 / 0.01**2 + 1 / 0.02**2)))
+    wider = firm.spread(firm.covariance)
+    np.testing.assert_allclose(wider.covariance, 2 * firm.covariance)
+    R = so3_exp([0.3, -0.2, 0.5])
+    turned = firm.turned(R)
+    assert turned.turn_std == pytest.approx(firm.turn_std)
+    np.testing.assert_allclose(turned.turned(R.T).information, firm.information, atol=1e-6)
+
+
+def test_outliers_lose_their_weight() -> None:
+    camera = Camera(200.0, 200.0, 79.5, 59.5, 160, 120)
+    rng = np.random.default_rng(0)
+    points, truth = rng.uniform(-0.1, 0.1, (60, 3)), Pose(so3_exp([0.1, -0.05, 0.2]), [0.02, -0.01, 0.6])
+    pixels = camera.project(truth.apply(points))
+    pixels[:15] += rng.uniform(10, 30, (15, 2))
+    start = Pose(np.eye(3), [0.0, 0.0, 0.62])
+    terms = [Belief.about(start, camera, 1.0, 50.0, 1.0), Points(points, pixels, np.ones(60), np.full(60, 0.3))]
+    found = fuse(start, terms, camera, steps=20)
+    assert found is not None
+    turn, shift = pose_error(found.pose, truth)
+    assert np.rad2deg(turn) < 0.3 and shift < 0.002
 
 
 def test_a_small_predicted_angle_leaves_the_pose_where_asked(model: ObjectModel, renderer: Renderer) -> None:
-    config = replace(STEADY, motion="none", still_deg=5.0)
-    following = tracker(model, renderer, path(model, 1), config, pose=path(model, 0))
-    found = following.step(photograph(renderer, model, path(model, 1)).image)
-    assert found.T_cam_obj is not None
-    np.testing.assert_array_equal(found.T_cam_obj.matrix, path(model, 0).matrix)
+    """With the picture still, only the network could move it."""
+    turns = []
+    for still in (0.0, 5.0):
+        config = TrackConfig(still_deg=still, outline=False)
+        following = tracker(model, renderer, path(model, 1), config, pose=path(model, 0))
+        for _ in range(4):
+            found = following.step(photograph(renderer, model, path(model, 0)).image)
+        assert found.T_cam_obj is not None
+        turns.append(np.rad2deg(pose_error(found.T_cam_obj, path(model, 0))[0]))
+    assert turns[0] > 0.3 and turns[1] < 0.1
 
 
 def test_a_large_turn_is_compared_again(model: ObjectModel, renderer: Renderer) -> None:
     for iterations, calls in ((1, 1), (3, 2)):
-        config = replace(STEADY, motion="none", iterations=iterations)
-        following = tracker(model, renderer, path(model, 5), config, pose=path(model, 0))
-        following.step(photograph(renderer, model, path(model, 5)).image)
+        config = TrackConfig(motion="none", outline=False, iterations=iterations, again_deg=2.0)
+        following = tracker(model, renderer, path(model, 6), config, pose=path(model, 0))
+        following.step(photograph(renderer, model, path(model, 0)).image)
+        following.step(photograph(renderer, model, path(model, 6)).image)
         assert following.predictor.calls == calls  # type: ignore[attr-defined]
 
 
@@ -146,8 +226,11 @@ def test_a_large_predicted_angle_restarts(model: ObjectModel, renderer: Renderer
     following = tracker(
         model, renderer, truth, pose=truth, estimator=Estimator(model, renderer, truth), detector=finder
     )
+    image = photograph(renderer, model, truth).image
     following.predictor.angles = [0.6]  # type: ignore[attr-defined]  # above 25 degrees
-    found = following.step(photograph(renderer, model, truth).image)
+    states = [following.step(image).state for _ in range(3)]
+    assert states == [TRACKED] * 3, "the first pose is given; one frame in doubt is no loss"
+    found = following.step(image)
     assert found.state == RESTARTED and finder.calls == 1
     following.predictor.angles = [0.01]  # type: ignore[attr-defined]
     assert following.step(photograph(renderer, model, truth).image).state == TRACKED
@@ -169,22 +252,33 @@ def test_what_disappears_is_lost_soon_and_found_again(model: ObjectModel, render
     assert states.count(RESTARTED) == 1 and states[-1] == TRACKED
 
 
-def test_what_leaves_the_picture_is_lost_at_once(model: ObjectModel, renderer: Renderer) -> None:
-    outside = Pose(path(model, 0).R, [0.6, 0.0, 0.6])
-    following = tracker(model, renderer, outside, replace(STEADY, motion="none"), pose=path(model, 0))
-    assert following.step(photograph(renderer, model, path(model, 0)).image).state == LOST
-    assert following.step(photograph(renderer, model, path(model, 0)).image).state == LOST, "nobody searches"
+def test_what_leaves_the_picture_is_lost(model: ObjectModel, renderer: Renderer) -> None:
+    leaving = [Pose(path(model, 0).R, [0.2 + 0.02 * k, 0.0, 0.6]) for k in range(25)]
+    following = tracker(model, renderer, leaving[0], pose=leaving[0])
+    states = []
+    for pose in leaving:
+        following.predictor.truth = pose  # type: ignore[attr-defined]
+        states.append(following.step(photograph(renderer, model, pose).image).state)
+    assert states[:5] == [TRACKED] * 5 and states[-5:] == [LOST] * 5, "nobody searches"
+    assert states == sorted(states, reverse=True)
+    outside = tracker(model, renderer, leaving[-1], pose=leaving[-1])
+    assert outside.step(backdrop()).state == LOST, "the first pose shows nothing of it"
 
 
-def test_the_mask_is_the_poses_or_none(model: ObjectModel, renderer: Renderer) -> None:
+def test_the_mask_is_the_coloured_part_the_poses_or_none(model: ObjectModel, renderer: Renderer) -> None:
     seen = []
-    for mask in ("pose", "none"):
+    for mask in ("pose", "none", "colours"):
         following = tracker(model, renderer, path(model, 0), replace(STEADY, mask=mask), pose=path(model, 0))
+        following.step(photograph(renderer, model, path(model, 0)).image)
         answer = following.predictor.predict
         following.predictor.predict = lambda o, r, answer=answer: seen.append((o[0].mask, r[0].mask)) or answer(o, r)  # type: ignore
-        following.step(photograph(renderer, model, path(model, 0)).image)
+        covered = photograph(renderer, model, path(model, 0)).image.copy()
+        covered[:240] = backdrop()[:240]
+        following.step(covered)
     np.testing.assert_array_equal(*seen[0])
     assert seen[1][0] is None
+    part, whole = seen[2]
+    assert 0.2 < part.sum() / whole.sum() < 0.8 and not (part & ~whole).any()
 
 
 def test_memory_does_not_grow(model: ObjectModel, renderer: Renderer) -> None:
@@ -217,7 +311,8 @@ def test_what_cannot_be_tracked_is_said(model: ObjectModel, renderer: Renderer) 
     for wrong in (
         {"still_deg": 30},
         {"iterations": 0},
-        {"gain": 2},
+        {"alike": 2},
+        {"keep": 0},
         {"mask": "true"},
         {"motion": "x"},
         {"runtime": "x"},
@@ -262,7 +357,7 @@ def test_a_video_becomes_poses_and_an_overlay(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     c = example.view.camera
     (folder / "camera.txt").write_text(f"{c.fx},{c.fy},{c.cx},{c.cy}")
-    done = run(folder, "--pose", folder / "pose.json", "--out", tmp_path / "out", "--gain", 1, "--still-angle", 0)
+    done = run(folder, "--pose", folder / "pose.json", "--out", tmp_path / "out", "--still-angle", 0)
     assert done.exit_code == 0, done.output
     assert "5 tracked" in done.stdout
     lines = [json.loads(line) for line in (tmp_path / "out" / "poses.jsonl").read_text().splitlines()]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 import time
 from fractions import Fraction
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 from posekit.errors import ImageError, InputError
-from posekit.video import Frame, LatestFrames, VideoFrames, VideoWriter, open_frames
+from posekit.video import Frame, ReadAhead, VideoFrames, VideoWriter, open_frames
 
 SIZE = (96, 64)
 
@@ -170,17 +171,32 @@ class Ticking:
 
 def test_latest_frames_are_dropped_and_never_late() -> None:
     read = []
-    for frame in LatestFrames(Ticking()):
+    for frame in ReadAhead(Ticking(), latest=True):
         read.append(frame.number)
         time.sleep(0.03)
     assert 2 <= len(read) < 40 and read == sorted(read)
 
 
-def test_a_failing_camera_is_told_to_the_reader() -> None:
+def test_frames_that_are_read_ahead_all_come() -> None:
+    frames = ReadAhead(Ticking())
+    assert [frame.number for frame in frames] == list(range(60)) and frames.rate == 200.0
+    for frame in frames:  # whoever stops reading stops the reading
+        if frame.number == 3:
+            break
+    for _ in range(100):
+        if not any(thread.name == "posekit-frames" for thread in threading.enumerate()):
+            break
+        time.sleep(0.05)
+    else:
+        raise AssertionError("the thread reads on")
+
+
+@pytest.mark.parametrize("latest", [True, False])
+def test_a_failing_camera_is_told_to_the_reader(latest: bool) -> None:
     class Failing(Ticking):
         def __iter__(self):  # type: ignore[no-untyped-def]
             yield Frame(0, None)
             raise InputError("unplugged")
 
     with pytest.raises(InputError, match="unplugged"):
-        list(LatestFrames(Failing()))
+        list(ReadAhead(Failing(), latest=latest))

@@ -1,8 +1,7 @@
 """How an object moved from one frame to the next, by following points of its picture. Layer 3.
 
 Corners of the last frame that lie on the object are followed into the next one (Lucas and Kanade, forwards and
-backwards), and the pose that explains them starts the comparison with the mesh. It needs no mask of the new frame, and
-it drifts: what corrects it is the comparison.
+backwards). It needs no mask of the new frame, and it drifts: what corrects it is the comparison with the mesh.
 """
 
 from __future__ import annotations
@@ -14,79 +13,62 @@ import numpy as np
 from numpy.typing import NDArray
 
 from posekit.camera import Zoom
+from posekit.fusion import Points
 from posekit.geometry import Pose
 from posekit.object_model import ObjectModel
-from posekit.pnp import solve_pnp
-from posekit.render import Renderer
 from posekit.view import View
-from posekit.zoom import zoom_to_pose
 
-SIZE = (320, 240)  # of the crops in which points are followed
 WINDOW, LEVELS = (13, 13), 3
-CORNERS, QUALITY, APART = 200, 0.005, 4  # at most; of the best one; pixels between two
+CORNERS, QUALITY, APART = 200, 0.005, 3  # at most; of the best one; pixels between two
 AGAIN = 0.7  # pixels from where it started that a point followed forwards and backwards may end
-LEAST = 12  # points
-SCALE = 0.5  # pixels, expected error of a followed point
+LEAST = 6  # points
+SIGMA, TOGETHER = 0.5, 3.0  # pixels, expected error of a followed point; so many err alike
 
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """A frame's crop round the object at a pose. seen: what the frame shows. drawn: the mesh there. T_cam_obj: the
-    pose. T_view_cam: the crop's turn. size: (width, height) of the frame."""
+    """A frame's crop round the object, and the mesh drawn there.
+
+    seen: what the frame shows. drawn: with image, mask and coords, at ``T_view_ctr``. visible: (H, W), where the crop
+    shows the object rather than something before it.
+    """
 
     seen: View
     drawn: View
-    T_cam_obj: Pose
-    T_view_cam: Pose
-    size: tuple[int, int]
+    T_view_ctr: Pose
+    visible: NDArray[np.bool_]
+
+    def again(self, view: View) -> View:
+        """The same crop of the next frame."""
+        return view.zoomed(Zoom(view.camera, self.seen.camera, self.seen.R_view_cam))
 
 
-def look(view: View, T_cam_obj: Pose, model: ObjectModel, renderer: Renderer) -> Look:
-    """Raises ValueError where the pose is behind the camera."""
-    zoom = zoom_to_pose(view.camera, T_cam_obj @ model.T_obj_ctr, model.outline - model.center, SIZE)
-    T_view_cam = Pose.rotation(zoom.R_view_cam)
-    [drawn] = renderer.render(model, [T_view_cam @ T_cam_obj], zoom.camera, rgb=False)
-    return Look(view.zoomed(zoom), drawn, T_cam_obj, T_view_cam, view.camera.size)
+def follow_points(before: Look, pose: Pose, after: View, model: ObjectModel) -> Points | None:
+    """Points of the object, and where they are in the next frame.
 
-
-def colours(at: Look) -> NDArray[np.float32]:
-    """The share of each of 8 x 8 x 8 colours in what the frame shows inside the silhouette, flat; zeros where the
-    silhouette is empty."""
-    assert at.drawn.mask is not None
-    counts = cv2.calcHist([at.seen.image], [0, 1, 2], at.drawn.mask.astype(np.uint8), [8, 8, 8], [0, 256] * 3).ravel()
-    return np.asarray(counts / max(1.0, float(counts.sum())), np.float32)
-
-
-@dataclass(frozen=True, eq=False)
-class Followed:
-    """pose: ``T_cam_obj`` in the next frame, None where too few points could be followed. share: of the points that
-    could."""
-
-    pose: Pose | None
-    share: float
-
-
-def follow_points(before: Look, after: View, model: ObjectModel) -> Followed:
-    """From the last frame's crop into the next frame, which has the same size."""
-    drawn, zoom_camera = before.drawn, before.drawn.camera
+    before: the last frame's crop; pose: ``T_view_ctr`` in it, near the one at which it was drawn. after: the same crop
+    of the next frame. None where too few can be followed.
+    """
+    drawn, camera = before.drawn, before.drawn.camera
     assert drawn.mask is not None and drawn.coords is not None
-    zoom = Zoom(after.camera, zoom_camera, before.T_view_cam.R)
-    first, second = (cv2.cvtColor(v.image, cv2.COLOR_RGB2GRAY) for v in (before.seen, after.zoomed(zoom)))
-    inside = cv2.erode(drawn.mask.astype(np.uint8), np.ones((5, 5), np.uint8))
+    first, second = (cv2.cvtColor(v.image, cv2.COLOR_RGB2GRAY) for v in (before.seen, after))
+    solid = drawn.mask & before.visible & before.seen.shown & after.shown
+    inside = cv2.erode(solid.astype(np.uint8), np.ones((5, 5), np.uint8))
     corners = cv2.goodFeaturesToTrack(first, CORNERS, QUALITY, APART, mask=inside)
     if corners is None or len(corners) < LEAST:
-        return Followed(None, 0.0)
+        return None
     places, steady = _followed(first, second, corners)
+    corners = corners[:, 0]
+    # which point of the mesh is seen at a corner: the one drawn where the corner was, before the pose was corrected
+    here = drawn.coords[tuple(np.rint(corners).astype(int).T[::-1])] - model.center
+    corrected = camera.project(pose.apply(here)) - camera.project(before.T_view_ctr.apply(here))
+    columns, rows = np.clip(np.rint(corners - corrected).astype(int), 0, np.array(camera.size) - 1).T
+    steady &= drawn.mask[rows, columns]
     if steady.sum() < LEAST:
-        return Followed(None, float(steady.mean()))
-    pixels = np.rint(corners[:, 0]).astype(int)
-    points = drawn.coords[pixels[:, 1], pixels[:, 0]][steady] - model.center
-    targets = (places - corners[:, 0] + pixels)[steady]
-    start = before.T_view_cam @ before.T_cam_obj @ model.T_obj_ctr
-    weights = np.ones(len(points))
-    found = solve_pnp(points, targets, weights, SCALE * weights, zoom_camera, start)
-    pose = None if found is None else before.T_view_cam.inverse() @ found @ model.T_obj_ctr.inverse()
-    return Followed(pose, float(steady.mean()))
+        return None
+    points = drawn.coords[rows, columns][steady].astype(np.float64) - model.center
+    targets = camera.project(pose.apply(points)) + (places - corners)[steady]
+    return Points(points, targets, np.ones(len(points)), np.full(len(points), SIGMA), together=TOGETHER)
 
 
 def _followed(

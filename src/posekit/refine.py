@@ -109,11 +109,24 @@ def compare(
     renderer: Renderer,
 ) -> tuple[list[PairPrediction], list[View], list[View]]:
     """Zoom to each pose, draw the object there, and let the predictor compare. poses: ``T_cam_obj``."""
-    zooms = [zoom_to_pose(view.camera, T @ model.T_obj_ctr, outline, predictor.size) for T in poses]
+    observed, rendered = crops(view, model, outline, poses, predictor.size, renderer, coords=predictor.dense)
+    return predictor.predict(observed, rendered), observed, rendered
+
+
+def crops(
+    view: View,
+    model: ObjectModel,
+    outline: NDArray[np.float64],
+    poses: Sequence[Pose],
+    size: tuple[int, int],
+    renderer: Renderer,
+    coords: bool = True,
+) -> tuple[list[View], list[View]]:
+    """The photograph zoomed to each ``T_cam_obj``, and the object drawn there. size: (width, height)."""
+    zooms = [zoom_to_pose(view.camera, T @ model.T_obj_ctr, outline, size) for T in poses]
     observed = [view.zoomed(zoom) for zoom in zooms]
     turned = [Pose.rotation(zoom.R_view_cam) @ T for zoom, T in zip(zooms, poses, strict=True)]
-    rendered = renderer.render(model, turned, [z.camera for z in zooms], coords=predictor.dense)
-    return predictor.predict(observed, rendered), observed, rendered
+    return observed, renderer.render(model, turned, [z.camera for z in zooms], coords=coords)
 
 
 def update_pose(

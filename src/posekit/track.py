@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -19,17 +20,27 @@ from numpy.typing import NDArray
 from posekit.camera import Camera
 from posekit.errors import CameraError, ConfigError
 from posekit.estimate import PoseEstimator
+from posekit.fusion import Belief, Lines, Points, Term, fuse
 from posekit.geometry import Pose, rotation_angle, so3_exp, so3_log
+from posekit.nets.pose_delta import apply_delta
 from posekit.nets.predictor import PairPrediction, Predictor
 from posekit.object_model import ObjectModel
-from posekit.odometry import Look, colours, follow_points, look
-from posekit.refine import compare, predicted_angle, update_pose
+from posekit.odometry import Look, follow_points
+from posekit.refine import crops
+from posekit.region import Colours, learn, like_mesh, outline_lines
 from posekit.results import Detection, Estimate
 from posekit.view import View
 
 TRACKED, RESTARTED, LOST = "tracked", "restarted", "lost"
-MASKS, MOTIONS, RUNTIMES = ("pose", "none"), ("points", "velocity", "none"), ("openvino", "torch")
+MASKS, MOTIONS, RUNTIMES = ("colours", "pose", "none"), ("points", "velocity", "none"), ("openvino", "torch")
 NEAR = 0.6  # diameters, the least distance of an object's centre that is believed
+# standard deviations of a turn in degrees, a shift in pixels of the crop, and a depth in shares of the distance
+GIVEN = (1.0, 0.5, 0.005)  # of a first pose
+AHEAD = (10.0, 8.0, 0.05)  # of the motion between two frames, where they are compared
+UNSEEN = (6.0, 4.0, 0.02)  # of that motion, when nothing else is known about it
+SUREST = (0.3, 0.1, 0.003)  # of any pose: errors last over many frames
+TOGETHER, DOUBTED = 25.0, math.radians(4.0)  # so many correspondences err alike, and at this predicted angle twice that
+LEAST_SCALE, KNEE = 0.5, 2.5  # pixels, no correspondence is more exact; standard deviations
 
 
 class Finder(Protocol):
@@ -40,26 +51,28 @@ class Finder(Protocol):
 
 @dataclass(frozen=True)
 class TrackConfig:
-    """restart_deg, still_deg: predicted angles that restart, and that leave the pose where the comparison started, both
-    degrees. iterations: comparisons of a frame at most; a second one follows a turn of more than ``again_deg``.
-    motion: where a frame's comparison starts: where followed points lead ("points"), the share ``prior`` of the last
-    motion once more ("velocity"), or the last pose ("none"). mask: what a frame's mask is taken to be, the silhouette
-    where the comparison starts ("pose") or nothing ("none"). gain: share of the comparison's update that is made.
-    alike: likeness of the colours inside the silhouette to what they were (overlap of their histograms), below which a
-    pose is in doubt. learn: share of a frame in what they were. least_inside: share of the silhouette's box in the
-    picture, likewise. doubts: frames in a row after which the object is lost. search: frames between two attempts to
-    find it. first: least score of a first pose. runtime: of the network."""
+    """restart_deg, still_deg: predicted angles above which a frame is in doubt, and below which the network leaves the
+    pose to points and outline, both degrees. iterations: comparisons of a frame at most; a second one follows a turn of
+    more than ``again_deg``. motion: where a frame's comparison starts: where followed points lead ("points"), the share
+    ``prior`` of the last motion once more ("velocity"), or the last pose ("none"). outline: whether the colours' place
+    of the outline counts. mask: what a frame's mask is taken to be: where the silhouette has the object's colours
+    ("colours"), all of it ("pose"), or nothing ("none"). keep: share of what was known that holds for the next frame.
+    alike: share of the silhouette with the object's colours, below which a frame is in doubt. learn: share of a frame
+    in these colours. least_inside: share of the silhouette's box in the picture, likewise. doubts: frames in doubt in a
+    row after which the object is lost. search: frames between two attempts to find it. first: least score of a first
+    pose. runtime: of the network."""
 
     restart_deg: float = 25.0
-    still_deg: float = 2.0
+    still_deg: float = 0.0
     again_deg: float = 8.0
     iterations: int = 1
     motion: str = "points"
     prior: float = 0.7
-    mask: str = "pose"
-    gain: float = 1.0
-    alike: float = 0.65
-    learn: float = 0.02
+    outline: bool = True
+    mask: str = "colours"
+    keep: float = 0.7
+    alike: float = 0.3
+    learn: float = 0.1
     least_inside: float = 0.3
     doubts: int = 3
     search: int = 5
@@ -74,8 +87,10 @@ class TrackConfig:
             )
         if min(self.iterations, self.doubts, self.search) < 1:
             raise ConfigError("iterations, doubts and search are at least 1.")
-        if not (0 <= self.prior <= 1 and 0 <= self.gain <= 1 and 0 <= self.least_inside <= 1):
-            raise ConfigError("prior, gain and least_inside are shares between 0 and 1.")
+        if not all(0 <= share <= 1 for share in (self.prior, self.alike, self.learn, self.least_inside, self.first)):
+            raise ConfigError("prior, alike, learn, least_inside and first are shares between 0 and 1.")
+        if not 0 < self.keep <= 1:
+            raise ConfigError(f"keep is a share above 0, at most 1, not {self.keep:g}.")
         for name, known in (("mask", MASKS), ("motion", MOTIONS), ("runtime", RUNTIMES)):
             if getattr(self, name) not in known:
                 raise ConfigError(f"{name} is one of {', '.join(known)}, not {getattr(self, name)!r}.")
@@ -84,7 +99,7 @@ class TrackConfig:
 @dataclass(frozen=True, eq=False)
 class Tracked:
     """What a frame says about the object. state: "tracked", "restarted" (a new first pose) or "lost". estimate: None
-    where it is lost; its score is the confidence, the likeness of its colours to what they were."""
+    where it is lost; its score is the share of its silhouette that has the object's colours."""
 
     state: str
     estimate: Estimate | None = None
@@ -127,10 +142,12 @@ class Tracker:
         self.predictor = predictor or _predictor(self.estimator, config)
         self.renderer, self.detector = self.estimator.renderer, detector
         self._outline = model.outline - model.center
-        self._pose = pose
+        self._beside = ThreadPoolExecutor(1, "posekit-network")
+        self._given = pose  # a first pose that no frame has been seen with
+        self._belief: Belief | None = None  # ``T_cam_ctr``
         self._motion = Pose.identity()  # of the object's centre and axes, from the frame before the last to the last
         self._before: Look | None = None
-        self._colours: NDArray[np.float32] | None = None  # of the object, as it was seen
+        self._colours: Colours | None = None
         self._doubts = 0
         self._waiting = 0  # frames until the next search
 
@@ -140,79 +157,158 @@ class Tracker:
         if chosen is None:
             raise CameraError("the tracker was made without a camera: pass one with each frame.")
         view = View(image, chosen)
-        last, found = self._pose, None
-        if last is not None:
-            found = self._follow(view, last)
-            if (
-                found is None
-                or math.degrees(found[0].angle) > self.config.restart_deg
-                or self._lost_sight(view, found[0])
-            ):
-                self._lose()
-        if self._pose is None:
-            return self._find(view)
-        assert last is not None and found is not None
-        estimate, self._before = found
-        self._motion, self._pose = self._moved(last, estimate.T_cam_obj), estimate.T_cam_obj
-        if not self._doubts:
-            self._learn(self._before, self.config.learn)
-        return Tracked(TRACKED, estimate)
+        if self._given is not None:
+            started, pose, self._given = time.perf_counter(), self._given, None
+            if self._begin(view, pose, math.radians(GIVEN[0])):
+                timings = {"network": 0.0, "total": time.perf_counter() - started}
+                return Tracked(TRACKED, self._estimate(view, pose, math.radians(GIVEN[0]), 0, 1.0, timings))
+        if self._belief is not None:
+            found = self._follow(view, self._belief)
+            if found is not None and not self._lost_sight(view, found):
+                return Tracked(TRACKED, found)
+            self._lose()
+        return self._find(view)
 
     # --- following ---
 
-    def _follow(self, view: View, last: Pose) -> tuple[Estimate, Look] | None:
+    def _begin(self, view: View, pose: Pose, turn_std: float) -> bool:
+        """Start from a first pose; whether the mesh is seen there. turn_std: radians."""
+        self._belief = self._before = self._colours = None
+        if not self._in_front(pose):
+            return False
+        seen, drawn = self._crops(view, pose)
+        assert drawn.mask is not None
+        if not (drawn.mask & seen.shown).any():
+            return False
+        centred = pose @ self.model.T_obj_ctr
+        _, shift, depth = GIVEN
+        self._belief = Belief.about(centred, seen.camera, turn_std, shift, depth)
+        visible = like_mesh(seen, drawn)
+        if (visible & drawn.mask).sum() < 0.15 * drawn.mask.sum():
+            visible = np.ones_like(visible)
+        self._colours = learn(seen, drawn.mask, visible)
+        self._before = Look(seen, drawn, Pose.rotation(seen.R_view_cam) @ centred, visible)
+        return True
+
+    def _follow(self, view: View, last: Belief) -> Estimate | None:
         """From where the object is expected; None where it cannot be compared."""
-        started = time.perf_counter()
-        pose, angle, network = self._expected(view, last), 0.0, 0.0
-        for k in range(self.config.iterations):
+        started, network, angle, comparisons = time.perf_counter(), 0.0, 0.0, 0
+        before, colours = self._before, self._colours
+        assert before is not None and colours is not None
+        ahead = self._ahead(view, before, last, colours)
+        belief = ahead
+        while comparisons < self.config.iterations:
+            comparisons += 1
+            pose = belief.pose @ self.model.T_obj_ctr.inverse()
             if not self._in_front(pose):
                 return None
-            updated, angle, seconds = self._compared(view, pose)
-            network += seconds
-            if updated is None:
+            seen, drawn = self._crops(view, pose)
+            assert drawn.mask is not None
+            visible = colours.seen(seen)
+            answer = self._beside.submit(self._asked, seen, drawn, visible)
+            look = Look(seen, drawn, Pose.rotation(seen.R_view_cam) @ belief.pose, visible)
+            lines = self._lines(look, colours)  # while the network thinks
+            newer = learn(seen, drawn.mask, visible)
+            prediction, seconds = answer.result()
+            network, angle = network + seconds, prediction.angle
+            agreed = self._agreed(ahead, look, prediction, lines)
+            if agreed is None:
                 return None
-            turn = math.degrees(rotation_angle(updated.R @ pose.R.T))
-            if math.degrees(angle) >= self.config.still_deg:
-                pose = self._between(pose, updated)
-            if turn < self.config.again_deg or k + 1 == self.config.iterations:
+            turn = math.degrees(rotation_angle(agreed.pose.R @ belief.pose.R.T))
+            belief = agreed
+            if turn < self.config.again_deg:
                 break
+        pose = belief.pose @ self.model.T_obj_ctr.inverse()
         if not self._in_front(pose):
             return None
-        at = look(view, pose, self.model, self.renderer)
-        now = colours(at)
-        likeness = float(np.minimum(now, now if self._colours is None else self._colours).sum())
+        assert drawn.mask is not None
+        shown = drawn.mask & seen.shown
+        share = float((visible & shown).sum() / max(1, shown.sum()))
+        self._motion = Pose(belief.pose.R @ last.pose.R.T, belief.pose.t - last.pose.t)
+        self._belief, self._before = belief, look
+        if angle < math.radians(self.config.restart_deg) and share > self.config.alike:
+            self._colours = colours.mixed(newer, self.config.learn)
         timings = {"network": network, "total": time.perf_counter() - started}
-        box = view.camera.points_box(_before_camera(pose.apply(self.model.outline)))
-        return Estimate(pose, angle, k + 1, True, likeness, box, self.model.name, timings=timings), at
+        return self._estimate(view, pose, angle, comparisons, share, timings)
 
-    def _compared(self, view: View, pose: Pose) -> tuple[Pose | None, float, float]:
-        """The pose after one prediction, the predicted angle, and the seconds that the network took."""
-        masking = _Masking(self.predictor, self.config.mask == "pose")
-        [prediction], [seen], [drawn] = compare(view, self.model, self._outline, [pose], masking, self.renderer)
-        update = "correspondence" if self.predictor.dense else "regression"
-        updated = update_pose(pose, self.model, prediction, seen, drawn, update)
-        return updated, predicted_angle(pose, prediction, updated, update), masking.seconds
-
-    def _expected(self, view: View, last: Pose) -> Pose:
-        """Where the object should be in this frame, by ``config.motion``."""
+    def _ahead(self, view: View, before: Look, last: Belief, colours: Colours) -> Belief:
+        """Where the object is expected, as ``T_cam_ctr``: from the last frame, without a comparison with the mesh."""
+        camera, R = before.drawn.camera, before.seen.R_view_cam
+        believed = last.turned(R)
+        start = self._expected(believed.pose, R)
+        known: list[Term] = [_about(start, camera, AHEAD)]
+        motion: list[Term] = [_about(start, camera, UNSEEN)]
+        seen = before.again(view)
         if self.config.motion == "points":
-            if self._before is None or self._before.size != view.camera.size:
-                return last
-            return follow_points(self._before, view, self.model).pose or last
-        share = self.config.prior if self.config.motion == "velocity" else 0.0
-        centred = last @ self.model.T_obj_ctr
-        R = so3_exp(so3_log(self._motion.R) * share) @ centred.R
-        return Pose(R, centred.t + share * self._motion.t) @ self.model.T_obj_ctr.inverse()
+            points = follow_points(before, start, seen, self.model)
+            if points is not None:
+                known.append(points)
+                motion.append(points)
+        lines = self._lines(replace(before, seen=seen, visible=colours.seen(seen)), colours)
+        found = fuse(start, [*known, *lines], camera)
+        pose = start if found is None else found.pose
+        moved = np.sum([term.equations(pose, camera)[0] for term in motion], axis=0)
+        covariance = believed.covariance / self.config.keep + np.linalg.inv(moved)
+        return Belief(pose, np.asarray(np.linalg.inv(covariance))).turned(R.T)
 
-    def _between(self, pose: Pose, updated: Pose) -> Pose:
-        """The share ``gain`` of the way, about the object's centre."""
-        a, b, gain = pose @ self.model.T_obj_ctr, updated @ self.model.T_obj_ctr, self.config.gain
-        R = so3_exp(gain * so3_log(b.R @ a.R.T)) @ a.R
-        return Pose(R, a.t + gain * (b.t - a.t)) @ self.model.T_obj_ctr.inverse()
+    def _expected(self, last: Pose, R_view_cam: NDArray[np.float64]) -> Pose:
+        """``T_view_ctr`` after the last motion, where that is to be repeated."""
+        if self.config.motion != "velocity":
+            return last
+        share = self.config.prior
+        turn = so3_exp(R_view_cam @ so3_log(self._motion.R) * share)
+        return Pose(turn @ last.R, last.t + share * (R_view_cam @ self._motion.t))
 
-    def _moved(self, before: Pose, after: Pose) -> Pose:
-        a, b = before @ self.model.T_obj_ctr, after @ self.model.T_obj_ctr
-        return Pose(b.R @ a.R.T, b.t - a.t)
+    def _agreed(self, ahead: Belief, look: Look, prediction: PairPrediction, lines: list[Lines]) -> Belief | None:
+        """What the network, the outline and the frames before say together."""
+        camera, R = look.drawn.camera, look.seen.R_view_cam
+        network: list[Term] = []
+        if self.config.still_deg <= math.degrees(prediction.angle) < self.config.restart_deg:
+            network = self._network(look, prediction)
+        found = fuse(look.T_view_ctr, [ahead.turned(R), *network, *lines], camera)
+        if found is None:
+            return None
+        return found.spread(_about(found.pose, camera, SUREST).covariance).turned(R.T)
+
+    def _lines(self, look: Look, colours: Colours) -> list[Lines]:
+        if not self.config.outline:
+            return []
+        lines = outline_lines(look.seen, look.drawn, colours, look.visible, self.model.center)
+        return [] if lines is None else [lines]
+
+    def _crops(self, view: View, pose: Pose) -> tuple[View, View]:
+        """What the frame shows round a ``T_cam_obj``, and the mesh drawn there."""
+        [seen], [drawn] = crops(view, self.model, self._outline, [pose], self.predictor.size, self.renderer)
+        return seen, drawn
+
+    def _asked(self, seen: View, drawn: View, visible: NDArray[np.bool_]) -> tuple[PairPrediction, float]:
+        """The network's answer, and the seconds that it took."""
+        assert drawn.mask is not None
+        mask = {"colours": drawn.mask & visible, "pose": drawn.mask, "none": None}[self.config.mask]
+        started = time.perf_counter()
+        [prediction] = self.predictor.predict([seen.with_mask(mask)], [drawn])
+        return prediction, time.perf_counter() - started
+
+    def _network(self, look: Look, prediction: PairPrediction) -> list[Term]:
+        """The network's correspondences, or where it has none, the pose it leads to."""
+        found, camera = prediction.correspondences, look.drawn.camera
+        if found is None:
+            target = apply_delta(look.T_view_ctr, prediction.delta, camera.fx)
+            spread = max(prediction.angle, math.radians(GIVEN[0]))
+            return [Belief.about(target, camera, spread, 1.0, 0.02)] if target.t[2] > 0 else []
+        assert look.drawn.coords is not None
+        points = look.drawn.coords[found.source[:, 1], found.source[:, 0]] - self.model.center
+        if not len(points):
+            return []
+        together = TOGETHER * (1 + (prediction.angle / DOUBTED) ** 2)
+        scale = np.maximum(found.scale_px, LEAST_SCALE)
+        return [Points(points.astype(np.float64), found.target, found.visible, scale, KNEE, together)]
+
+    def _estimate(
+        self, view: View, pose: Pose, angle: float, iterations: int, score: float, timings: dict[str, float]
+    ) -> Estimate:
+        box = view.camera.points_box(_before_camera(pose.apply(self.model.outline)))
+        return Estimate(pose, angle, iterations, True, score, box, self.model.name, timings=timings)
 
     def _in_front(self, pose: Pose) -> bool:
         return bool(np.isfinite(pose.matrix).all() and pose.apply(self.model.center)[2] > NEAR * self.model.diameter)
@@ -225,19 +321,17 @@ class Tracker:
         width, height = view.camera.size
         inside = max(0.0, min(x1, width) - max(x0, 0.0)) * max(0.0, min(y1, height) - max(y0, 0.0))
         share = inside / max((x1 - x0) * (y1 - y0), 1e-9)
-        doubted = share < self.config.least_inside or found.score < self.config.alike
+        doubted = (
+            share < self.config.least_inside
+            or found.score < self.config.alike
+            or math.degrees(found.angle) > self.config.restart_deg
+        )
         self._doubts = self._doubts + 1 if doubted else 0
         return share == 0 or self._doubts >= self.config.doubts
 
-    def _learn(self, at: Look, share: float) -> None:
-        """What the object's colours are, from what they were and from this frame."""
-        now = colours(at)
-        self._colours = now if self._colours is None else (1 - share) * self._colours + share * now
-
     def _lose(self) -> None:
-        self._pose, self._before, self._motion = None, None, Pose.identity()
-        self._colours = None
-        self._doubts = self._waiting = 0
+        self._belief = self._before = self._colours = None
+        self._motion, self._doubts, self._waiting = Pose.identity(), 0, 0
 
     def _find(self, view: View) -> Tracked:
         """A new first pose, where there is one. A search takes seconds, so not every frame is searched."""
@@ -247,28 +341,15 @@ class Tracker:
         self._waiting = self.config.search
         detections = [d for d in self.detector.detect(view, [self.model]) if d.label in (None, self.model.name)]
         found = max(self.estimator.estimate(view, detections), key=lambda e: e.score, default=None)
-        if found is None or found.score < self.config.first:
+        if found is None or found.score < self.config.first or not self._begin(view, found.T_cam_obj, found.angle):
             return Tracked(LOST)
-        self._pose, self._waiting = found.T_cam_obj, 0
-        self._before = look(view, found.T_cam_obj, self.model, self.renderer)
-        self._learn(self._before, 1.0)
+        self._waiting = 0
         return Tracked(RESTARTED, found)
 
 
-class _Masking:
-    """A predictor that is given the rendered mask as the observed one, or none, and that counts its seconds."""
-
-    def __init__(self, predictor: Predictor, rendered: bool) -> None:
-        self.predictor, self.rendered, self.seconds = predictor, rendered, 0.0
-        self.size, self.dense = predictor.size, predictor.dense
-
-    def predict(self, observed: Sequence[View], rendered: Sequence[View]) -> list[PairPrediction]:
-        pairs = zip(observed, rendered, strict=True)
-        seen = [view.with_mask(drawn.mask if self.rendered else None) for view, drawn in pairs]
-        started = time.perf_counter()
-        answers = self.predictor.predict(seen, rendered)
-        self.seconds += time.perf_counter() - started
-        return answers
+def _about(pose: Pose, camera: Camera, spread: tuple[float, float, float]) -> Belief:
+    turn, shift, depth = spread
+    return Belief.about(pose, camera, math.radians(turn), shift, depth)
 
 
 def _predictor(estimator: PoseEstimator, config: TrackConfig) -> Predictor:

@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from queue import Empty, Queue
+from queue import Empty, Full, Queue
 from threading import Event, Thread
 from types import TracebackType
 from typing import Any, Protocol
@@ -28,6 +28,7 @@ log = logging.getLogger("posekit")
 Image = NDArray[np.uint8]
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 RATE = 30.0  # frames a second, where nothing says how many
+AHEAD = 4  # frames
 MOST_FAILURES = 100  # frames of a camera or video that may fail one after the other
 
 
@@ -248,23 +249,24 @@ class CameraFrames:
             self.capture.release()
 
 
-class LatestFrames:
-    """Always the newest frame of a source that runs beside: what comes while another is worked on is dropped.
+class ReadAhead:
+    """Frames of a source that is read beside the work on them, a few ahead.
 
-    Whoever reads it is at most one frame behind a camera, however slow. For cameras; of a file almost all is dropped.
+    latest: always the newest one; what comes while another is worked on is dropped. Whoever reads is then at most one
+    frame behind a camera, however slow. For cameras; of a file almost all is dropped.
     """
 
-    def __init__(self, source: Frames) -> None:
-        self.source, self.rate = source, source.rate
-        self.count: int | None = None
+    def __init__(self, source: Frames, latest: bool = False) -> None:
+        self.source, self.rate, self.latest = source, source.rate, latest
+        self.count = None if latest else source.count
 
     def __iter__(self) -> Iterator[Frame]:
-        newest: Queue[Frame | BaseException | None] = Queue(1)
+        waiting: Queue[Frame | BaseException | None] = Queue(1 if self.latest else AHEAD)
         ended = Event()
-        reader = Thread(target=_keep_newest, args=(self.source, newest, ended), daemon=True)
-        reader.start()
+        arguments = self.source, waiting, ended, self.latest
+        Thread(target=_read, args=arguments, name="posekit-frames", daemon=True).start()
         try:
-            while (frame := newest.get()) is not None:
+            while (frame := waiting.get()) is not None:
                 if isinstance(frame, BaseException):
                     raise frame
                 yield frame
@@ -272,32 +274,43 @@ class LatestFrames:
             ended.set()
 
 
-def _keep_newest(source: Frames, newest: Queue[Frame | BaseException | None], ended: Event) -> None:
+def _read(source: Frames, waiting: Queue[Frame | BaseException | None], ended: Event, latest: bool) -> None:
+    last: BaseException | None = None
     try:
         for frame in source:
-            if ended.is_set():
+            if latest:
+                with suppress(Empty):
+                    waiting.get_nowait()
+            if not _handed_on(frame, waiting, ended):
                 return
-            with suppress(Empty):
-                newest.get_nowait()
-            newest.put(frame)
-    except BaseException as error:  # told to the reader
-        newest.put(error)
-        return
-    newest.put(None)
+    except BaseException as error:  # told to whoever reads
+        last = error
+    _handed_on(last, waiting, ended)
+
+
+def _handed_on(frame: Frame | BaseException | None, waiting: Queue[Frame | BaseException | None], ended: Event) -> bool:
+    """False when nobody reads any more."""
+    while not ended.is_set():
+        with suppress(Full):
+            waiting.put(frame, timeout=0.1)
+            return True
+    return False
 
 
 class VideoWriter:
     """An MP4 (H.264, 4:2:0) that browsers play, written beside its name and renamed when it is closed.
 
-    Frames of another size than the first are fitted into it. Raises OutputError where it cannot be written.
+    Frames of another size than the first are fitted into it. quality: x264's constant rate factor, lower is better.
+    Raises OutputError where it cannot be written.
     """
 
-    def __init__(self, path: Path, rate: float) -> None:
+    def __init__(self, path: Path, rate: float, quality: int = 23) -> None:
         try:
             import av
         except ImportError as error:
             raise OutputError("writing a video needs PyAV: pip install av.") from error
         self.path, self.part, self.rate = path, path.with_name(f".{path.stem}.part{path.suffix}"), rate
+        self.quality = quality
         self._av = av
         self._container: Any = None
         self._stream: Any = None
@@ -324,7 +337,7 @@ class VideoWriter:
         rate = Fraction(self.rate).limit_denominator(1001)
         self._stream = self._container.add_stream("libx264", rate=rate)
         self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, "yuv420p"
-        self._stream.options = {"preset": "veryfast", "crf": "23"}
+        self._stream.options = {"preset": "veryfast", "crf": str(self.quality)}
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
         if self._container is None:

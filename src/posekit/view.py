@@ -35,6 +35,11 @@ class View:
             if array is not None and array.shape[:2] != size:
                 raise ValueError(f"View: {name} is {array.shape[:2]}, its camera {size} (height, width)")
 
+    @property
+    def shown(self) -> NDArray[np.bool_]:
+        """Pixels (H, W) that are not black: what lies outside a zoomed photograph is."""
+        return np.asarray(cv2.cvtColor(self.image, cv2.COLOR_RGB2GRAY) > 0)
+
     def with_mask(self, mask: NDArray[np.bool_] | None) -> View:
         return replace(self, mask=mask)
 

@@ -56,18 +56,26 @@ def track(
     ] = 25.0,
     still_angle: Annotated[
         float,
-        typer.Option(metavar="DEGREES", help="Predicted angle that leaves the pose as it is.", rich_help_panel=LOOP),
-    ] = 2.0,
+        typer.Option(
+            metavar="DEGREES",
+            help="Predicted angle below which the network leaves the pose as it is; the paper has 2.",
+            rich_help_panel=LOOP,
+        ),
+    ] = 0.0,
     motion: Annotated[
         Literal["points", "velocity", "none"],
         typer.Option(help="What foretells the next pose: followed points, the last motion.", rich_help_panel=LOOP),
     ] = "points",
     mask: Annotated[
-        Literal["pose", "none"], typer.Option(help="What a frame's mask is taken to be.", rich_help_panel=LOOP)
-    ] = "pose",
-    gain: Annotated[
-        float, typer.Option(min=0, max=1, help="Share of the network's update that is made.", rich_help_panel=LOOP)
-    ] = 1.0,
+        Literal["colours", "pose", "none"],
+        typer.Option(
+            help="What a frame's mask is taken to be: the silhouette's part of the object's colours, or all of it.",
+            rich_help_panel=LOOP,
+        ),
+    ] = "colours",
+    outline: Annotated[
+        bool, typer.Option(help="Whether the outline that the colours show counts.", rich_help_panel=LOOP)
+    ] = True,
     runtime: Annotated[
         Literal["openvino", "torch"], typer.Option(help="Of the network.", rich_help_panel=LOOP)
     ] = "openvino",
@@ -90,18 +98,16 @@ def track(
     from posekit.load import load_pose
     from posekit.object_model import ObjectModel
     from posekit.track import TrackConfig, Tracker
-    from posekit.video import LatestFrames, open_frames
+    from posekit.video import ReadAhead, open_frames
 
     if pose and len(pose) != len(model):
         raise PromptError(f"{len(pose)} --pose for {len(model)} --model: give one for each, in their order, or none.")
     config = TrackConfig(
-        restart_angle, still_angle, iterations=iterations, motion=motion, mask=mask, gain=gain, runtime=runtime
+        restart_angle, still_angle, iterations=iterations, motion=motion, mask=mask, outline=outline, runtime=runtime
     )
     starts = [load_pose(path) for path in pose] if pose else [None] * len(model)
     meshes = [ObjectModel.load(path, units=units, symmetry=symmetry) for path in model]
-    sequence: Frames = open_frames(source, camera)
-    if live:
-        sequence = LatestFrames(sequence)
+    sequence = ReadAhead(open_frames(source, camera), latest=live)
     finder = None
     if not pose or detector is not None:
         from posekit.novel import make_detector
