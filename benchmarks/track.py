@@ -1,6 +1,6 @@
 """Tracking on sequences with known truth: speed from the video's bytes to the pose, and how good the poses are.
 
-    python benchmarks/track.py DIR [DIR ...] [--weights FILE] [--frames N] [--set KEY=VALUE ...] [--json FILE]
+    python benchmarks/track.py DIR [DIR ...] [--weights FILE] [--frames N] [--set KEY=VALUE ...] [--json FILE] [--plot SVG]
 
 DIR is a data set in BOP layout made by `posekit synth --kind sequence`. Every scene becomes a video, and every object
 in it is followed alone from its true pose in the first frame that shows half of it; when it is lost, its true mask,
@@ -27,10 +27,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import spearmanr
 
 from posekit.camera import mask_box
 from posekit.data.bop import BopDataset, Instance
 from posekit.estimate import PoseEstimator
+from posekit.evaluate.charts import Axes, lines
 from posekit.geometry import Pose, rotation_angle
 from posekit.metrics import pose_error
 from posekit.object_model import ObjectModel
@@ -40,6 +42,12 @@ from posekit.video import ReadAhead, SceneFrames, VideoFrames, VideoWriter
 from posekit.view import View
 
 SEEN, HALF = 0.1, 0.5
+BINS, LEAST = (0, 1, 2, 3, 5, 8, 12, 18, 25, 40), 10  # degrees of predicted angle; frames
+SVG = "http://www.w3.org/2000/svg"
+STYLE = (
+    "text{font:12px sans-serif}.left{text-anchor:end}.middle{text-anchor:middle}.grid{stroke:#ddd}"
+    ".line{fill:none;stroke-width:2}.c0{stroke:#2b6cb0}.c1{stroke:#2f855a}.c2{stroke:#c05621}"
+)
 
 
 class TrueMasks:
@@ -151,6 +159,32 @@ def jitter(rows: list[dict[str, Any]]) -> tuple[float | None, float | None]:
     return (float(np.median(turns)), float(np.median(shifts))) if turns else (None, None)
 
 
+def calibration(rows: Sequence[dict[str, Any]]) -> str:
+    """An SVG: median and quantiles of the rotation error over the predicted angle, in bins; and prints the table."""
+    told = [r for r in rows if r["state"] == TRACKED and r["visible"] >= SEEN and r["angle"] is not None and "re" in r]
+    angles, errors = (np.array([r[key] for r in told]) for key in ("angle", "re"))
+    places, shares = [], []
+    for low, high in itertools.pairwise(BINS):
+        chosen = (angles >= low) & (angles < high)
+        if chosen.sum() >= LEAST:
+            places.append(float(angles[chosen].mean()))
+            shares.append(np.percentile(errors[chosen], (50, 68, 95)))
+            quantiles = " / ".join(f"{value:.1f}" for value in shares[-1])
+            within = 100 * (errors[chosen] < 5).mean()
+            print(
+                f"predicted {low} to {high} deg: {chosen.sum()} frames, error {quantiles} deg, {within:.0f} % below 5"
+            )
+    print(f"rank correlation {spearmanr(angles, errors)[0]:.2f} over {len(told)} frames")
+    axes = Axes("predicted angle, degrees", "rotation error, degrees", float(BINS[-1]), 50.0)
+    curves = [(name, places, [row[k] for row in shares]) for k, name in enumerate(("median", "68 %", "95 %"))]
+    clipped = [(name, x, np.minimum(y, axes.y_to)) for name, x, y in curves]
+    return (
+        lines(axes, clipped, "Error of tracked frames")
+        .replace("<svg", f'<svg xmlns="{SVG}"', 1)
+        .replace(">", f"><style>{STYLE}</style>", 1)
+    )
+
+
 def changed(texts: Sequence[str]) -> TrackConfig:
     """``--set``, with each option's own type."""
     config = TrackConfig()
@@ -168,6 +202,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int)
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="of TrackConfig")
     parser.add_argument("--json", type=Path, help="every frame, for plots")
+    parser.add_argument("--plot", type=Path, metavar="SVG", help="the true error against the predicted angle")
     args = parser.parse_args()
     config, kept = changed(args.set), []
     for root in args.roots:
@@ -190,6 +225,8 @@ def main() -> None:
                     ]
                     values = "  ".join(f"{k} {v:.3g}" if v is not None else f"{k} -" for k, v in summary(rows).items())
                     print(f"{root.name} scene {scene} object {obj_id}: {values}", flush=True)
+    if args.plot:
+        args.plot.write_text(calibration(kept))
     if args.json:
         args.json.write_text(json.dumps(kept))
 

@@ -17,7 +17,7 @@ LAYERS = {
     0: {"geometry", "camera", "files"},
     1: {"view", "object_model", "results"},
     2: {"load", "zoom", "metrics", "pnp", "fusion", "render", "nets", "detect", "draw"},
-    3: {"data", "refine", "hypotheses", "figures", "odometry", "video", "contour", "region"},
+    3: {"data", "refine", "hypotheses", "figures", "odometry", "video", "contour", "region", "recording"},
     4: {"estimate", "novel"},
     5: {"search", "track", "evaluate", "train"},
     6: {"cli"},
@@ -39,6 +39,7 @@ DOORS = {
     "huggingface_hub": {"data"},
     "pycocotools": {"detect"},
     "av": {"video"},
+    "rerun": {"recording"},
     "openvino": {"nets", "cli"},
 }
 

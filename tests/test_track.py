@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import tracemalloc
 from collections.abc import Sequence
 from dataclasses import replace
@@ -18,12 +19,13 @@ from objects import bracket
 from posekit.camera import Camera
 from posekit.cli.app import app
 from posekit.data.example import Example, make_example, ply
-from posekit.errors import CameraError, ConfigError
+from posekit.errors import CameraError, ConfigError, OutputError
 from posekit.fusion import Belief, Points, fuse
 from posekit.geometry import Pose, rotation_angle, so3_exp, view_rotation
 from posekit.metrics import pose_error
 from posekit.object_model import ObjectModel
 from posekit.odometry import Look, follow_points
+from posekit.recording import Recorder
 from posekit.refine import crops
 from posekit.region import learn, outline_lines
 from posekit.render import Renderer
@@ -357,7 +359,7 @@ def test_a_video_becomes_poses_and_an_overlay(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     c = example.view.camera
     (folder / "camera.txt").write_text(f"{c.fx},{c.fy},{c.cx},{c.cy}")
-    done = run(folder, "--pose", folder / "pose.json", "--out", tmp_path / "out", "--still-angle", 0)
+    done = run(folder, "--pose", folder / "pose.json", "--out", tmp_path / "out", "--still-angle", 0, "--rerun")
     assert done.exit_code == 0, done.output
     assert "5 tracked" in done.stdout
     lines = [json.loads(line) for line in (tmp_path / "out" / "poses.jsonl").read_text().splitlines()]
@@ -372,8 +374,17 @@ def test_a_video_becomes_poses_and_an_overlay(
     assert rows[0] == "scene_id,im_id,obj_id,score,R,t,time" and len(rows) == 6
     assert float(rows[1].split(",")[5].split()[2]) == pytest.approx(1000 * first.t[2])
     assert len(list(VideoFrames(tmp_path / "out" / "overlay.mp4", None))) == 5
+    recorded = (tmp_path / "out" / "track.rrd").read_bytes()
+    assert recorded[:3] == b"RRF" and b"objects/0-toy" in recorded and b"camera/image" in recorded
+    assert not list((tmp_path / "out").glob(".*"))
     again = run(folder, "--pose", folder / "pose.json", "--out", tmp_path / "out")
     assert again.exit_code == 1 and "--force" in again.stderr
+
+
+def test_a_recording_without_rerun_says_what_to_install(model: ObjectModel, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    with pytest.raises(OutputError, match="posekit\\[rerun\\]"):
+        Recorder(Path("a.rrd"), [model])
 
 
 def test_nothing_to_track_is_an_error(folder: Path, tmp_path: Path) -> None:

@@ -81,6 +81,9 @@ def track(
     ] = "openvino",
     threads: ThreadsOption = None,
     overlay: Annotated[bool, typer.Option(help="Write overlay.mp4.", rich_help_panel=OUTPUT)] = True,
+    rerun: Annotated[
+        bool, typer.Option("--rerun", help="Write track.rrd for the Rerun viewer.", rich_help_panel=OUTPUT)
+    ] = False,
     live: Annotated[
         bool, typer.Option("--live", help="Drop frames to keep up with a camera.", rich_help_panel=OUTPUT)
     ] = False,
@@ -119,7 +122,7 @@ def track(
                 estimator=PoseEstimator(mesh, preset=preset, weights=weights, options=chosen, threads=threads))
         for mesh, start in zip(meshes, starts, strict=True)
     ]  # fmt: skip
-    counts = _run(trackers, sequence, folder, overlay, frames)
+    counts = _run(trackers, sequence, folder, overlay, rerun, frames)
     typer.echo(", ".join(f"{count} {state}" for state, count in counts.states.items()))
     if counts.problems:
         typer.echo(f"{len(counts.problems)} frames could not be used; the first: {counts.problems[0]}", err=True)
@@ -144,7 +147,9 @@ class _Counts:
         self.files: list[str] = ["poses.jsonl", "poses.csv"]
 
 
-def _run(trackers: Sequence[Tracker], sequence: Frames, folder: Any, overlay: bool, most: int | None) -> _Counts:
+def _run(
+    trackers: Sequence[Tracker], sequence: Frames, folder: Any, overlay: bool, rerun: bool, most: int | None
+) -> _Counts:
     """Track every frame, and write each as soon as it is done: a killed run keeps its frames."""
     from posekit.errors import OutputError
     from posekit.video import VideoWriter
@@ -155,7 +160,13 @@ def _run(trackers: Sequence[Tracker], sequence: Frames, folder: Any, overlay: bo
         lines, table = ((folder.path / name).open("w", encoding="utf-8", buffering=1) for name in counts.files)
     except OSError as error:
         raise OutputError(f"the folder {folder.path} cannot be written: {error.strerror}.") from error
-    with lines, table, VideoWriter(folder.path / "overlay.mp4", sequence.rate) as writer, _bar(sequence) as show:
+    with (
+        lines,
+        table,
+        VideoWriter(folder.path / "overlay.mp4", sequence.rate) as writer,
+        _recorder(folder.path / "track.rrd", trackers, rerun) as record,
+        _bar(sequence) as show,
+    ):
         table.write(COLUMNS + "\n")
         for done, frame in enumerate(sequence):
             if most is not None and done >= most:
@@ -167,11 +178,14 @@ def _run(trackers: Sequence[Tracker], sequence: Frames, folder: Any, overlay: bo
                 lines.write(_line(frame, tracker.model.name, result) + "\n")
                 if result.estimate is not None:
                     table.write(_row(frame, _number(tracker.model.name, k), result, seconds) + "\n")
+            record(frame, results)
             if overlay and frame.image is not None:
                 _draw(writer, frame, trackers, results)
             show(seconds, results)
     if overlay and counts.used:
         counts.files.append("overlay.mp4")
+    if rerun:
+        counts.files.append("track.rrd")
     return counts
 
 
@@ -241,6 +255,23 @@ def _draw(writer: VideoWriter, frame: Frame, trackers: Sequence[Tracker], result
         length = 0.6 * float(tracker.model.extents.max())
         picture = draw.axes(picture, frame.camera, result.T_cam_obj, length, tracker.model.center)
     writer.write(draw.caption(picture, f"{frame.number}  " + "  ".join(told)))
+
+
+@contextmanager
+def _recorder(path: Path, trackers: Sequence[Tracker], wanted: bool) -> Iterator[Any]:
+    """What is called with each frame and its results."""
+    if not wanted:
+        yield lambda *_: None
+        return
+    from posekit.recording import Recorder
+
+    with Recorder(path, [tracker.model for tracker in trackers]) as recorder:
+
+        def record(frame: Frame, results: Sequence[Tracked]) -> None:
+            found = [(result.state, result.T_cam_obj, result.angle) for result in results]
+            recorder.frame(frame.number, frame.image, frame.camera, found)
+
+        yield record
 
 
 @contextmanager
