@@ -1,6 +1,7 @@
 """Tracking on sequences with known truth: speed from the video's bytes to the pose, and how good the poses are.
 
-    python benchmarks/track.py DIR [DIR ...] [--weights FILE] [--frames N] [--set KEY=VALUE ...] [--json FILE] [--plot SVG]
+    python benchmarks/track.py DIR [DIR ...] [--weights FILE] [--frames N] [--set KEY=VALUE ...]
+                               [--json FILE] [--plot SVG]
 
 DIR is a data set in BOP layout made by `posekit synth --kind sequence`. Every scene becomes a video, and every object
 in it is followed alone from its true pose in the first frame that shows half of it; when it is lost, its true mask,
@@ -37,7 +38,7 @@ from posekit.geometry import Pose, rotation_angle
 from posekit.metrics import pose_error
 from posekit.object_model import ObjectModel
 from posekit.results import Detection
-from posekit.track import LOST, RESTARTED, TrackConfig, Tracked, Tracker
+from posekit.track import LOST, RESTARTED, TRACKED, TrackConfig, Tracked, Tracker
 from posekit.video import ReadAhead, SceneFrames, VideoFrames, VideoWriter
 from posekit.view import View
 
@@ -178,11 +179,9 @@ def calibration(rows: Sequence[dict[str, Any]]) -> str:
     axes = Axes("predicted angle, degrees", "rotation error, degrees", float(BINS[-1]), 50.0)
     curves = [(name, places, [row[k] for row in shares]) for k, name in enumerate(("median", "68 %", "95 %"))]
     clipped = [(name, x, np.minimum(y, axes.y_to)) for name, x, y in curves]
-    return (
-        lines(axes, clipped, "Error of tracked frames")
-        .replace("<svg", f'<svg xmlns="{SVG}"', 1)
-        .replace(">", f"><style>{STYLE}</style>", 1)
-    )
+    figure = lines(axes, clipped, "Error of tracked frames")
+    drawing = figure[figure.index("<svg") : figure.index("</svg>") + len("</svg>")]
+    return drawing.replace("<svg ", f'<svg xmlns="{SVG}" ', 1).replace(">", f"><style>{STYLE}</style>", 1)
 
 
 def changed(texts: Sequence[str]) -> TrackConfig:
