@@ -15,7 +15,7 @@ import pytest
 from typer.testing import CliRunner
 
 from bop_scene import write_scene
-from objects import bracket
+from objects import bracket, cuboid
 from posekit.camera import Camera
 from posekit.cli.app import app
 from posekit.data.example import Example, make_example, ply
@@ -24,7 +24,7 @@ from posekit.fusion import Belief, Points, fuse
 from posekit.geometry import Pose, rotation_angle, so3_exp, view_rotation
 from posekit.metrics import pose_error
 from posekit.object_model import ObjectModel
-from posekit.odometry import Look, follow_points
+from posekit.odometry import Look, follow_points, match_texture
 from posekit.recording import Recorder
 from posekit.refine import crops
 from posekit.region import learn, outline_lines
@@ -130,6 +130,31 @@ def test_followed_points_alone_carry_a_pose(model: ObjectModel, renderer: Render
     assert follow_points(empty, empty.T_view_ctr, empty.again(flat), model) is None
 
 
+def parcel() -> ObjectModel:
+    """A box of many colours."""
+    vertices, faces = cuboid((-0.06, -0.04, -0.03), (0.06, 0.04, 0.03), 9)
+    colours = np.random.default_rng(5).integers(20, 235, (len(vertices), 3)).astype(np.uint8)
+    return ObjectModel.from_arrays(vertices, faces, name="parcel", colors=colours)
+
+
+def test_texture_leads_from_the_drawn_mesh_to_the_frame(renderer: Renderer) -> None:
+    model = parcel()
+    view = photograph(renderer, model, path(model, 0))
+    darker = View((0.5 * view.image.astype(np.float32) + 20).astype(np.uint8), CAMERA)
+    for shown in (view, darker):
+        at = looked(shown, model, renderer, path(model, 0.6))
+        points = match_texture(at, model)
+        assert points is not None
+        prior = Belief.about(at.T_view_ctr, at.drawn.camera, 0.2, 10.0, 0.1)
+        found = fuse(at.T_view_ctr, [prior, points], at.drawn.camera)
+        assert found is not None
+        pose = Pose.rotation(at.seen.R_view_cam.T) @ found.pose @ model.T_obj_ctr.inverse()
+        before, after = (pose_error(p, path(model, 0)) for p in (path(model, 0.6), pose))
+        assert after[0] < 0.5 * before[0] and after[1] < 0.5 * before[1]
+    noise = np.random.default_rng(2).integers(0, 255, (480, 640, 3)).astype(np.uint8)
+    assert match_texture(looked(View(noise, CAMERA), model, renderer, path(model, 0)), model) is None
+
+
 def test_hidden_points_are_not_followed(model: ObjectModel, renderer: Renderer) -> None:
     view = photograph(renderer, model, path(model, 0))
     at = looked(view, model, renderer, path(model, 0))
@@ -205,7 +230,7 @@ def test_a_small_predicted_angle_leaves_the_pose_where_asked(model: ObjectModel,
     """With the picture still, only the network could move it."""
     turns = []
     for still in (0.0, 5.0):
-        config = TrackConfig(still_deg=still, outline=False)
+        config = TrackConfig(still_deg=still, outline=False, texture=False)
         following = tracker(model, renderer, path(model, 1), config, pose=path(model, 0))
         for _ in range(4):
             found = following.step(photograph(renderer, model, path(model, 0)).image)
@@ -216,7 +241,7 @@ def test_a_small_predicted_angle_leaves_the_pose_where_asked(model: ObjectModel,
 
 def test_a_large_turn_is_compared_again(model: ObjectModel, renderer: Renderer) -> None:
     for iterations, calls in ((1, 1), (3, 2)):
-        config = TrackConfig(motion="none", outline=False, iterations=iterations, again_deg=2.0)
+        config = TrackConfig(motion="none", outline=False, texture=False, iterations=iterations, again_deg=2.0)
         following = tracker(model, renderer, path(model, 6), config, pose=path(model, 0))
         following.step(photograph(renderer, model, path(model, 0)).image)
         following.step(photograph(renderer, model, path(model, 6)).image)

@@ -1,7 +1,8 @@
-"""How an object moved from one frame to the next, by following points of its picture. Layer 3.
+"""Points that are followed, from one frame to the next and from the drawn mesh to the frame. Layer 3.
 
 Corners of the last frame that lie on the object are followed into the next one (Lucas and Kanade, forwards and
-backwards). It needs no mask of the new frame, and it drifts: what corrects it is the comparison with the mesh.
+backwards). It needs no mask of the new frame, and it drifts. Corners of the mesh as it is drawn, followed into the
+frame, do not drift; they need a texture that the mesh has too.
 """
 
 from __future__ import annotations
@@ -23,6 +24,10 @@ CORNERS, QUALITY, APART = 200, 0.005, 3  # at most; of the best one; pixels betw
 AGAIN = 0.7  # pixels from where it started that a point followed forwards and backwards may end
 LEAST = 6  # points
 SIGMA, TOGETHER = 0.5, 3.0  # pixels, expected error of a followed point; so many err alike
+# the same where the mesh's drawing is matched with the frame; and how far off a match may be, pixels
+TEXTURE_QUALITY, TEXTURE_SIGMA, TEXTURE_TOGETHER, FARTHEST = 0.02, 1.0, 0.7, 5.0
+ALIKE = (0.5, 0.8)  # correlations of patches from which on a match counts, and counts wholly
+PATCH, ROUND, FAINT = 9, 4.0, 4.0  # pixels; pixels; grey values below which contrast is noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +74,61 @@ def follow_points(before: Look, pose: Pose, after: View, model: ObjectModel) -> 
     points = drawn.coords[rows, columns][steady].astype(np.float64) - model.center
     targets = camera.project(pose.apply(points)) + (places - corners)[steady]
     return Points(points, targets, np.ones(len(points)), np.full(len(points), SIGMA), together=TOGETHER)
+
+
+def match_texture(look: Look, model: ObjectModel) -> Points | None:
+    """Points of the mesh, as drawn, and where the frame shows the same texture; None where too few are alike.
+
+    Both pictures are compared by their local contrast, since the light differs.
+    """
+    drawn, camera = look.drawn, look.drawn.camera
+    assert drawn.mask is not None and drawn.coords is not None
+    first, second = (_contrast(v.image) for v in (drawn, look.seen))
+    solid = drawn.mask & look.visible & look.seen.shown
+    inside = cv2.erode(solid.astype(np.uint8), np.ones((7, 7), np.uint8))
+    corners = cv2.goodFeaturesToTrack(first, CORNERS, TEXTURE_QUALITY, APART, mask=inside)
+    if corners is None or len(corners) < LEAST:
+        return None
+    places, steady = _followed(first, second, corners)
+    corners = corners[:, 0]
+    steady &= np.linalg.norm(places - corners, axis=1) < FARTHEST
+    if steady.sum() < LEAST:
+        return None
+    corners, places = corners[steady], places[steady]
+    columns, rows = np.rint(corners).astype(int).T
+    least, best = ALIKE
+    weight = np.clip((_alike(first, second, corners, places) - least) / (best - least), 0, 1).astype(np.float64)
+    if (weight > 0).sum() < LEAST:
+        return None
+    points = drawn.coords[rows, columns].astype(np.float64) - model.center
+    targets = camera.project(look.T_view_ctr.apply(points)) + (places - corners)
+    return Points(points, targets, weight, np.full(len(points), TEXTURE_SIGMA), together=TEXTURE_TOGETHER)
+
+
+def _contrast(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Grey values (H, W) less their surroundings' mean, over the surroundings' spread."""
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    centred = grey - cv2.GaussianBlur(grey, (0, 0), ROUND)
+    spread = np.sqrt(cv2.GaussianBlur(centred * centred, (0, 0), ROUND)) + FAINT
+    return np.asarray(np.clip(128 + 40 * centred / spread, 0, 255), np.uint8)
+
+
+def _alike(
+    first: NDArray[np.uint8], second: NDArray[np.uint8], corners: NDArray[np.float32], places: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Correlation (N,), -1 to 1, of the first picture round each corner with the second round its place."""
+    one, other = _patches(first, corners), _patches(second, places)
+    return np.asarray((one * other).sum(axis=1))
+
+
+def _patches(picture: NDArray[np.uint8], centres: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Pixels round each centre (N, 2), without mean and of length one: (N, PATCH**2)."""
+    reach = np.arange(PATCH) - PATCH // 2
+    offsets = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2)
+    at = np.clip(np.rint(centres)[:, None].astype(int) + offsets, 0, np.array(picture.shape[::-1]) - 1)
+    values = picture[at[..., 1], at[..., 0]].astype(np.float32)
+    values -= values.mean(axis=1, keepdims=True)
+    return np.asarray(values / (np.linalg.norm(values, axis=1, keepdims=True) + 1))
 
 
 def _followed(

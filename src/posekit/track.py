@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from posekit.camera import Camera
 from posekit.errors import CameraError, ConfigError
 from posekit.estimate import PoseEstimator
-from posekit.fusion import Belief, Lines, Points, Term, fuse
+from posekit.fusion import Belief, Points, Term, fuse
 from posekit.geometry import Pose, rotation_angle, so3_exp, so3_log
 from posekit.nets.pose_delta import apply_delta
 from posekit.nets.predictor import PairPrediction, Predictor
 from posekit.object_model import ObjectModel
-from posekit.odometry import Look, follow_points
+from posekit.odometry import Look, follow_points, match_texture
 from posekit.refine import crops
 from posekit.region import Colours, learn, like_mesh, outline_lines
 from posekit.results import Detection, Estimate
@@ -54,13 +54,13 @@ class TrackConfig:
     """restart_deg, still_deg: predicted angles above which a frame is in doubt, and below which the network leaves the
     pose to points and outline, both degrees. iterations: comparisons of a frame at most; a second one follows a turn of
     more than ``again_deg``. motion: where a frame's comparison starts: where followed points lead ("points"), the share
-    ``prior`` of the last motion once more ("velocity"), or the last pose ("none"). outline: whether the colours' place
-    of the outline counts. mask: what a frame's mask is taken to be: where the silhouette has the object's colours
-    ("colours"), all of it ("pose"), or nothing ("none"). keep: share of what was known that holds for the next frame.
-    alike: share of the silhouette with the object's colours, below which a frame is in doubt. learn: share of a frame
-    in these colours. least_inside: share of the silhouette's box in the picture, likewise. doubts: frames in doubt in a
-    row after which the object is lost. search: frames between two attempts to find it. first: least score of a first
-    pose. runtime: of the network."""
+    ``prior`` of the last motion once more ("velocity"), or the last pose ("none"). outline, texture: whether the
+    colours' place of the outline counts, and the mesh's texture where the frame shows it. mask: what a frame's mask is
+    taken to be: where the silhouette has the object's colours ("colours"), all of it ("pose"), or nothing ("none").
+    keep: share of what was known that holds for the next frame. alike: share of the silhouette with the object's
+    colours, below which a frame is in doubt. learn: share of a frame in these colours. least_inside: share of the
+    silhouette's box in the picture, likewise. doubts: frames in doubt in a row after which the object is lost. search:
+    frames between two attempts to find it. first: least score of a first pose. runtime: of the network."""
 
     restart_deg: float = 25.0
     still_deg: float = 0.0
@@ -69,6 +69,7 @@ class TrackConfig:
     motion: str = "points"
     prior: float = 0.7
     outline: bool = True
+    texture: bool = True
     mask: str = "colours"
     keep: float = 0.7
     alike: float = 0.3
@@ -207,11 +208,11 @@ class Tracker:
             visible = colours.seen(seen)
             answer = self._beside.submit(self._asked, seen, drawn, visible)
             look = Look(seen, drawn, Pose.rotation(seen.R_view_cam) @ belief.pose, visible)
-            lines = self._lines(look, colours)  # while the network thinks
+            others = self._lines(look, colours) + self._texture(look)  # while the network thinks
             newer = learn(seen, drawn.mask, visible)
             prediction, seconds = answer.result()
             network, angle = network + seconds, prediction.angle
-            agreed = self._agreed(ahead, look, prediction, lines)
+            agreed = self._agreed(ahead, look, prediction, others)
             if agreed is None:
                 return None
             turn = math.degrees(rotation_angle(agreed.pose.R @ belief.pose.R.T))
@@ -259,18 +260,22 @@ class Tracker:
         turn = so3_exp(R_view_cam @ so3_log(self._motion.R) * share)
         return Pose(turn @ last.R, last.t + share * (R_view_cam @ self._motion.t))
 
-    def _agreed(self, ahead: Belief, look: Look, prediction: PairPrediction, lines: list[Lines]) -> Belief | None:
-        """What the network, the outline and the frames before say together."""
+    def _agreed(self, ahead: Belief, look: Look, prediction: PairPrediction, others: list[Term]) -> Belief | None:
+        """What the network, others that compare the mesh, and the frames before say together."""
         camera, R = look.drawn.camera, look.seen.R_view_cam
         network: list[Term] = []
         if self.config.still_deg <= math.degrees(prediction.angle) < self.config.restart_deg:
             network = self._network(look, prediction)
-        found = fuse(look.T_view_ctr, [ahead.turned(R), *network, *lines], camera)
+        found = fuse(look.T_view_ctr, [ahead.turned(R), *network, *others], camera)
         if found is None:
             return None
         return found.spread(_about(found.pose, camera, SUREST).covariance).turned(R.T)
 
-    def _lines(self, look: Look, colours: Colours) -> list[Lines]:
+    def _texture(self, look: Look) -> list[Term]:
+        found = match_texture(look, self.model) if self.config.texture else None
+        return [] if found is None else [found]
+
+    def _lines(self, look: Look, colours: Colours) -> list[Term]:
         if not self.config.outline:
             return []
         lines = outline_lines(look.seen, look.drawn, colours, look.visible, self.model.center)

@@ -76,6 +76,9 @@ def track(
     outline: Annotated[
         bool, typer.Option(help="Whether the outline that the colours show counts.", rich_help_panel=LOOP)
     ] = True,
+    texture: Annotated[
+        bool, typer.Option(help="Whether the mesh's texture in the frame counts.", rich_help_panel=LOOP)
+    ] = True,
     runtime: Annotated[
         Literal["openvino", "torch"], typer.Option(help="Of the network.", rich_help_panel=LOOP)
     ] = "openvino",
@@ -106,7 +109,14 @@ def track(
     if pose and len(pose) != len(model):
         raise PromptError(f"{len(pose)} --pose for {len(model)} --model: give one for each, in their order, or none.")
     config = TrackConfig(
-        restart_angle, still_angle, iterations=iterations, motion=motion, mask=mask, outline=outline, runtime=runtime
+        restart_angle,
+        still_angle,
+        iterations=iterations,
+        motion=motion,
+        mask=mask,
+        outline=outline,
+        texture=texture,
+        runtime=runtime,
     )
     starts = [load_pose(path) for path in pose] if pose else [None] * len(model)
     meshes = [ObjectModel.load(path, units=units, symmetry=symmetry) for path in model]
