@@ -352,3 +352,15 @@ def test_the_shipped_detector_is_class_agnostic_and_small() -> None:
     detector = load_detector(SHIPPED)
     assert detector.config.novel and detector.config.backbone == "lite0"
     assert SHIPPED.with_suffix(".safetensors").stat().st_size < 10e6
+
+
+def test_what_the_config_says_of_units_holds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from posekit.train import detector
+
+    seen = []
+    monkeypatch.setattr(detector, "train_detector", lambda config, *_: seen.append(config.sources.units))
+    (tmp_path / "a.toml").write_text('[sources]\nunits = "m"\nmodels = ["a.ply"]\n')
+    for more in ([], ["--units", "mm"]):
+        command = ["train", "detector", "--config", str(tmp_path / "a.toml"), "--out", str(tmp_path / "t"), *more]
+        assert CliRunner().invoke(app, command).exit_code == 0
+    assert seen == ["m", "mm"]

@@ -244,7 +244,7 @@ def detector(
     agnostic: Annotated[
         bool, typer.Option("--agnostic", help="Objects of any kind, as one class.", rich_help_panel=SOURCES)
     ] = False,
-    units: Annotated[Units, typer.Option(help="Of the meshes.", rich_help_panel=SOURCES)] = "auto",
+    units: Annotated[Units | None, typer.Option(help="Of the meshes; auto.", rich_help_panel=SOURCES)] = None,
     backgrounds: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Photographs for backgrounds.", rich_help_panel=SOURCES)
     ] = None,
