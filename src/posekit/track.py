@@ -150,7 +150,6 @@ class Tracker:
         self._before: Look | None = None
         self._colours: Colours | None = None
         self._doubts = 0
-        self._failed = False  # whether the last search found nothing
         self._waiting = 0  # frames until the next search
 
     def step(self, image: NDArray[np.uint8], camera: Camera | None = None) -> Tracked:
@@ -164,12 +163,12 @@ class Tracker:
             if self._begin(view, pose, math.radians(GIVEN[0])):
                 timings = {"network": 0.0, "total": time.perf_counter() - started}
                 return Tracked(TRACKED, self._estimate(view, pose, math.radians(GIVEN[0]), 0, 1.0, timings))
-        if self._belief is None:
-            return self._find(view)
-        found = self._follow(view, self._belief)
-        if found is not None and not self._in_doubt(view, found):
-            return Tracked(TRACKED, found)
-        return self._searched(view, found)
+        if self._belief is not None:
+            found = self._follow(view, self._belief)
+            if found is not None and not self._lost_sight(view, found):
+                return Tracked(TRACKED, found)
+            self._lose()
+        return self._find(view)
 
     # --- following ---
 
@@ -321,37 +320,19 @@ class Tracker:
 
     # --- losing and finding ---
 
-    def _in_doubt(self, view: View, found: Estimate) -> bool:
-        """Whether frames have been doubtful for too long; at once where the object is outside the picture."""
-        seen = self._seen(view, found)
-        doubted = not seen or math.degrees(found.angle) > self.config.restart_deg
-        self._doubts = self._doubts + 1 if doubted else 0
-        if not doubted:
-            self._failed = False
-        return self._inside(view, found) == 0 or self._doubts >= self.config.doubts
-
-    def _seen(self, view: View, found: Estimate) -> bool:
-        return self._inside(view, found) >= self.config.least_inside and found.score >= self.config.alike
-
-    def _inside(self, view: View, found: Estimate) -> float:
-        """The share of the silhouette's box in the picture."""
+    def _lost_sight(self, view: View, found: Estimate) -> bool:
+        """Whether too little of the object has been seen for too long; at once where it is outside the picture."""
         x0, y0, x1, y1 = found.box
         width, height = view.camera.size
         inside = max(0.0, min(x1, width) - max(x0, 0.0)) * max(0.0, min(y1, height) - max(y0, 0.0))
-        return inside / max((x1 - x0) * (y1 - y0), 1e-9)
-
-    def _searched(self, view: View, found: Estimate | None) -> Tracked:
-        """A new first pose. Where there is none, what looks like the object is believed once more."""
-        kept = self._belief, self._before, self._colours, self._motion
-        hope = found is not None and self._seen(view, found) and self.detector is not None and not self._failed
-        self._lose()
-        again = self._find(view)
-        if again.state == LOST and hope:
-            self._belief, self._before, self._colours, self._motion = kept
-            self._failed, self._waiting = True, 0
-            return Tracked(TRACKED, found)
-        self._failed = False
-        return again
+        share = inside / max((x1 - x0) * (y1 - y0), 1e-9)
+        doubted = (
+            share < self.config.least_inside
+            or found.score < self.config.alike
+            or math.degrees(found.angle) > self.config.restart_deg
+        )
+        self._doubts = self._doubts + 1 if doubted else 0
+        return share == 0 or self._doubts >= self.config.doubts
 
     def _lose(self) -> None:
         self._belief = self._before = self._colours = None
