@@ -189,7 +189,8 @@ def test_training_writes_a_detector_that_a_config_file_describes(tmp_path: Path)
     assert read_config(tmp_path / "c.toml") == config
     rows = train_detector(config, tmp_path / "out")
     assert rows[-1]["step"] == "1" and 0 <= float(rows[-1]["mask_ap50"]) <= 1
-    assert load_detector(tmp_path / "out").config.classes == ("box",)
+    trained = load_detector(tmp_path / "out")
+    assert trained.config.classes == ("box",) and trained.about["trained_on"] == "composed scenes: renderings of box"
     (tmp_path / "bad.toml").write_text("epoks = 3")
     with pytest.raises(ConfigError, match="did you mean 'epochs'"):
         read_config(tmp_path / "bad.toml")

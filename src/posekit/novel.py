@@ -1,8 +1,9 @@
 """Objects that no detector was trained for: class-agnostic proposals, compared with a mesh's templates. Layer 4.
 
-A class-agnostic Mask R-CNN proposes instances of anything. Each is compared with the mesh: by the template
-search that also gives first poses (silhouette and normalised colour), and by the proposal network's own features,
-averaged over the silhouette, and by their median chroma. docs/decisions tells what each is worth.
+A class-agnostic Mask R-CNN proposes instances of anything, looking at the picture in more than one size. Each is
+compared with the mesh: by the proposal network's own features, averaged over the silhouette, by their median chroma,
+and, the likeliest, by the template search that also gives first poses (silhouette and normalised colour).
+docs/decisions tells what each is worth.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from posekit.camera import Camera
 from posekit.detect import Detector
 from posekit.detect.backbones import Lite0
 from posekit.detect.maskrcnn import COCO, SHIPPED, MaskRCNN, TrainedDetector, find, load_coco, load_detector
+from posekit.detect.vision import torchvision
 from posekit.errors import ConfigError
 from posekit.geometry import Pose, fibonacci_sphere, view_rotation
 from posekit.hypotheses import TemplateSearch
@@ -41,13 +43,18 @@ MARGIN = 1.1
 
 @dataclass(frozen=True)
 class NovelOptions:
-    """proposals: of a picture at most. least_proposal: their least score. least: the least score of a detection. most:
-    detections of a mesh. features: weight of the features against the templates. chroma: difference of the median a
-    and b (CIELAB, 8 bits) at which a score falls to 1/e. objectness: power of the proposal's own score. views: pictures
-    of a mesh whose features are kept. overlap: intersection over union from which two detections are of one instance.
+    """scales: of the detector's ``use_size``, one look at the picture each. proposals: of a look at most.
+    least_proposal: their least score. same: intersection over union of boxes from which two looks propose the same.
+    screened: proposals that are compared with templates. least: the least score of a detection. most: detections of a
+    mesh. features: weight of the features against the templates. chroma: difference of the median a and b (CIELAB, 8
+    bits) at which a score falls to 1/e. objectness: power of the proposal's own score. views: pictures of a mesh whose
+    features are kept. overlap: intersection over union of masks from which two detections are of one instance.
     """
 
-    proposals: int = 40
+    scales: tuple[float, ...] = (1.0, 4 / 3)
+    proposals: int = 80
+    same: float = 0.7
+    screened: int = 40
     least_proposal: float = 0.1
     least: float = 0.3
     most: int = 3
@@ -58,8 +65,16 @@ class NovelOptions:
     overlap: float = 0.5
 
     def __post_init__(self) -> None:
-        if min(self.proposals, self.most, self.views) < 1 or self.features < 0:
-            raise ConfigError("proposals, most and views are at least 1, features not negative.")
+        if min(len(self.scales), self.proposals, self.screened, self.most, self.views) < 1 or self.features < 0:
+            raise ConfigError("scales, proposals, screened, most and views are at least 1, features not negative.")
+
+
+@dataclass(frozen=True, eq=False)
+class _Looks:
+    """Of pictures. features: (N, C) of unit length, None for a backbone without them. chroma: (N, 2)."""
+
+    features: FArray | None
+    chroma: FArray
 
 
 class NovelDetector:
@@ -75,50 +90,61 @@ class NovelDetector:
                 "class-agnostic weights, or use it for its own classes."
             )
         self.detector, self.renderer, self.options = detector, renderer, options
-        self._known: WeakKeyDictionary[ObjectModel, tuple[TemplateSearch, FArray | None, FArray]] = WeakKeyDictionary()
+        self._known: WeakKeyDictionary[ObjectModel, tuple[TemplateSearch, _Looks]] = WeakKeyDictionary()
 
     def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
         """The instances of the models, each model's best first; with no models, whatever looks like an object."""
         proposals = self.propose(view)
         if not models:
             return proposals
-        seen = self._features([self._crop(view, p) for p in proposals]) if proposals else None
-        return [found for model in models for found in self._instances(view, model, proposals, seen)]
+        looks = self._looks(view, proposals)
+        return [found for model in models for found in self._instances(view, model, proposals, looks)]
 
     def propose(self, view: View) -> list[Detection]:
         """Objects of any kind, by falling score."""
         options = self.options
-        found = find(self.detector, view.image, least=options.least_proposal, most=options.proposals)
+        width, height = self.detector.config.use_size
+        sizes = [(round(scale * width), round(scale * height)) for scale in options.scales]
+        looks = [find(self.detector, view.image, least=options.least_proposal, most=options.proposals, size=size)
+                 for size in sizes]  # fmt: skip
+        boxes = np.concatenate([look.boxes for look in looks])
+        scores = np.concatenate([look.scores for look in looks])
+        masks = np.concatenate([look.masks for look in looks])
+        kept = torchvision().ops.nms(torch.from_numpy(boxes), torch.from_numpy(scores), options.same).numpy()
         return [
-            Detection((float(b[0]), float(b[1]), float(b[2]), float(b[3])), mask, float(score), None, "novel")
-            for b, mask, score in zip(found.boxes, found.masks, found.scores, strict=True)
+            Detection((float(x0), float(y0), float(x1), float(y1)), mask, float(score), None, "novel")
+            for (x0, y0, x1, y1), mask, score in zip(boxes[kept], masks[kept], scores[kept], strict=True)
         ]
 
     def similarities(self, view: View, model: ObjectModel, proposals: Sequence[Detection]) -> list[float]:
         """How much each proposal looks like the mesh, in [0, 1]."""
-        seen = self._features([self._crop(view, p) for p in proposals]) if proposals else None
-        return self._similarities(view, model, proposals, seen)
+        return self._similarities(view, model, proposals, self._looks(view, proposals))
 
     def _similarities(
-        self, view: View, model: ObjectModel, proposals: Sequence[Detection], seen: FArray | None
+        self, view: View, model: ObjectModel, proposals: Sequence[Detection], looks: _Looks
     ) -> list[float]:
-        search, features, chroma = self._of(model)
-        weight = self.options.features if features is not None else 0.0
-        scores = []
-        for k, proposal in enumerate(proposals):
-            first = search.search(view, proposal, 1)
-            score = max(0.0, first[0].score) / (1 + search.options.colour) if first else 0.0
-            if features is not None and seen is not None:
-                score += weight * max(0.0, float((features @ seen[k]).max()))
-            apart = float(np.linalg.norm(chroma - _chroma([self._crop(view, proposal)]), axis=1).min())
-            faded = float(np.exp(-apart / self.options.chroma)) * proposal.score**self.options.objectness
-            scores.append(min(1.0, score / (1 + weight)) * faded)
-        return scores
+        """In two rounds: what neither its features nor its chroma speaks for gets no template search, and 0."""
+        search, known = self._of(model)
+        options = self.options
+        alike, weight = np.zeros(len(proposals)), 0.0
+        if known.features is not None and looks.features is not None:
+            alike = np.maximum(0.0, (looks.features @ known.features.T).max(axis=1)).astype(np.float64)
+            weight = options.features
+        apart = np.linalg.norm(known.chroma[None] - looks.chroma[:, None], axis=2).min(axis=1)
+        own = np.array([proposal.score for proposal in proposals])
+        faded = np.exp(-apart / options.chroma) * own**options.objectness
+        screen = (alike if weight else 1.0) * faded
+        scores = np.zeros(len(proposals))
+        for k in np.argsort(-screen, kind="stable")[: options.screened]:
+            first = search.search(view, proposals[k], 1)
+            shape = max(0.0, first[0].score) / (1 + search.options.colour) if first else 0.0
+            scores[k] = min(1.0, (shape + weight * alike[k]) / (1 + weight)) * faded[k]
+        return [float(score) for score in scores]
 
     def _instances(
-        self, view: View, model: ObjectModel, proposals: Sequence[Detection], seen: FArray | None
+        self, view: View, model: ObjectModel, proposals: Sequence[Detection], looks: _Looks
     ) -> list[Detection]:
-        scores = self._similarities(view, model, proposals, seen)
+        scores = self._similarities(view, model, proposals, looks)
         kept: list[Detection] = []
         for k in np.argsort(np.negative(scores), kind="stable"):
             proposal, score = proposals[int(k)], scores[int(k)]
@@ -128,12 +154,18 @@ class NovelDetector:
                 kept.append(Detection(proposal.box, proposal.mask, score, model.name, "novel"))
         return kept
 
-    def _of(self, model: ObjectModel) -> tuple[TemplateSearch, FArray | None, FArray]:
+    def _of(self, model: ObjectModel) -> tuple[TemplateSearch, _Looks]:
         if model not in self._known:
-            search = TemplateSearch(model, self.renderer)
             pictures = self._pictures(model)
-            self._known[model] = search, self._features(pictures), _chroma(pictures)
+            self._known[model] = (
+                TemplateSearch(model, self.renderer),
+                _Looks(self._features(pictures), _chroma(pictures)),
+            )
         return self._known[model]
+
+    def _looks(self, view: View, proposals: Sequence[Detection]) -> _Looks:
+        crops = [self._crop(view, proposal) for proposal in proposals]
+        return _Looks(self._features(crops), _chroma(crops))
 
     def _pictures(self, model: ObjectModel) -> list[View]:
         distance = 4.0 * model.diameter

@@ -18,6 +18,7 @@ from torch.utils.data import IterableDataset
 from posekit._version import __version__
 from posekit.data.stream import Batch
 from posekit.data.tabletop_stream import (
+    AGNOSTIC_SHARE,
     LabelledImage,
     TabletopStream,
     TabletopStreamConfig,
@@ -221,7 +222,8 @@ class DetectorTask:
         return {"score": 1.0 - measured["mask_ap50"], **measured}
 
     def export(self, nets: nn.Module, out: Path, about: Mapping[str, Any]) -> None:
-        about = {**about, "version": __version__, "trained_on": f"composed scenes of {self.sources.about}"}
+        own = self.sources.about(AGNOSTIC_SHARE if self.config.agnostic else 1.0)
+        about = {**about, "version": __version__, "trained_on": f"composed scenes: {own}"}
         save_detector(out / "detector", self.config.network, nets, about)
 
     @cached_property
