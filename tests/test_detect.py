@@ -10,7 +10,9 @@ from objects import bracket
 from posekit.camera import Camera
 from posekit.detect import BoxPrompt, Detector, MaskPrompt
 from posekit.detect.prompts import clip_box, filled_mask, grabcut_mask
+from posekit.detect.sharpen import sharpened
 from posekit.errors import PromptError
+from posekit.results import Detection
 from posekit.view import View
 
 CAMERA = Camera(500.0, 500.0, 99.5, 74.5, 200, 150)
@@ -111,3 +113,33 @@ def test_mask_prompt() -> None:
         MaskPrompt(truth[::2, ::2]).detect(view, [bracket()])
     with pytest.raises(PromptError, match="empty"):
         MaskPrompt(np.zeros_like(truth)).detect(view, [bracket()])
+
+
+# --- a network's masks ---------------------------------------------------------------------------------------------
+
+
+def overlap(a: np.ndarray, b: np.ndarray) -> float:
+    return float((a & b).sum() / (a | b).sum())
+
+
+def test_a_rough_mask_is_laid_onto_the_colours() -> None:
+    view, truth = scene()
+    shifted = np.roll(truth, (5, -4), (0, 1))
+    for rough in (shifted, cv2.erode(truth.astype(np.uint8), np.ones((11, 11))) > 0):
+        found = sharpened(view.image, Detection(BOX, rough))
+        assert found.mask is not None and found.rough is rough and found.box == BOX
+        assert overlap(found.mask, truth) > 0.93 > 0.87 > overlap(rough, truth)
+    again = sharpened(view.image, Detection(BOX, rough))
+    np.testing.assert_array_equal(again.mask, found.mask)
+
+
+def test_a_mask_without_an_outline_in_the_picture_stays() -> None:
+    view, truth = scene()
+    elsewhere = np.zeros_like(truth)
+    elsewhere[45:60, 5:25] = True  # plain ground: no colours to part
+    tiny = np.zeros_like(truth)
+    tiny[75:77, 100:102] = True
+    for detection in (Detection((100.0, 75.0, 102.0, 77.0), tiny), Detection(BOX, None)):
+        assert sharpened(view.image, detection) is detection
+    found = sharpened(view.image, Detection((5.0, 45.0, 25.0, 60.0), elsewhere))
+    assert found.mask is not None and (found.rough is None or overlap(found.mask, elsewhere) >= 0.4)

@@ -9,8 +9,9 @@ import pytest
 
 from posekit.camera import Camera
 from posekit.data.example import make_example
+from posekit.data.tabletop import procedural_objects
 from posekit.errors import ConfigError, WeightsError
-from posekit.estimate import EstimateOptions, PoseEstimator, score
+from posekit.estimate import EstimateOptions, PoseEstimator, presence, score
 from posekit.geometry import Pose, PoseNoise
 from posekit.hypotheses import Agreement, poses_beside
 from posekit.metrics import pose_error
@@ -63,14 +64,15 @@ def test_the_whole_chain_from_a_mask(examples) -> None:
 
 
 def test_only_the_best_hypotheses_go_on(examples) -> None:
-    """All are refined a little, two to the end; a fixed number of iterations stays what was asked for."""
+    """All are refined a little, two to the end; a fixed number of iterations stays what was asked for. The last look is
+    the score's."""
     options = EstimateOptions(stop="fixed", iterations=5, hypotheses=4)
     estimator = PoseEstimator(examples[0].model, options=options)
     compared = []
     predict = estimator.predictor.predict
     estimator.predictor.predict = lambda seen, drawn: compared.append(len(seen)) or predict(seen, drawn)  # type: ignore
     [found] = estimator.estimate(examples[0].view, [masked(estimator.renderer, examples[0])])
-    assert compared == [4, 4, 4, 2, 2] and found.iterations == 5 and len(found.trace) == 5
+    assert compared == [4, 4, 4, 2, 2, 1] and found.iterations == 5 and len(found.trace) == 5
 
 
 def test_the_same_seed_gives_the_same_estimate(examples) -> None:
@@ -173,3 +175,31 @@ def test_the_score_prefers_small_angles_and_agreement() -> None:
     assert 0 < score(0.5, Agreement(0.9, 0.8)) < good < 1
     assert 0 < score(0.02, Agreement(0.5, 0.8)) < good
     assert score(0.02, Agreement(0.9, 0.1)) < good
+
+
+def test_what_is_not_there_is_doubted(examples) -> None:
+    """One photograph, two meshes: the one that it shows, and another one taken for it."""
+    example = examples[0]
+    [other] = procedural_objects(1, np.random.default_rng(5), unit=example.model.diameter)
+    detection = masked(PoseEstimator(example.model).renderer, example)
+    [shown], [absent] = (PoseEstimator(m).estimate(example.view, [detection]) for m in (example.model, other))
+    assert shown.score > 0.8 > 0.4 > absent.score
+    assert presence(Agreement(0.9, 0.5, 0.2), 0.9) > presence(Agreement(0.9, 0.5, 0.1), 0.9)
+    assert presence(Agreement(0.9, 0.5, 0.2), 0.9) > presence(Agreement(0.9, 0.5, 0.2), 0.7)
+    assert presence(Agreement(0.9, 0.5, 0.2), 0.9) > presence(Agreement(0.6, 0.5, 0.2), 0.9)
+
+
+def test_first_poses_come_from_both_masks(examples) -> None:
+    example = examples[0]
+    estimator = PoseEstimator(example.model, options=EstimateOptions(hypotheses=2))
+    mask = masked(estimator.renderer, example).mask
+    assert mask is not None
+    rough = np.zeros_like(mask)
+    x0, y0, x1, y1 = (int(edge) for edge in example.box)
+    rough[y0:y1, x0:x1] = True
+    alone = [estimator.first_poses(example.view, Detection(example.box, m)) for m in (mask, rough)]
+    both = estimator.first_poses(example.view, Detection(example.box, mask, rough=rough))
+    assert len(both) == 4
+    for found, wanted in zip(both[2:], alone[1], strict=True):
+        assert found.score == pytest.approx(wanted.score, abs=0.02)
+    assert both[0].score > both[2].score

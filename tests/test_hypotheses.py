@@ -81,6 +81,7 @@ def test_agreement_is_best_at_the_truth(renderer: Renderer) -> None:
     best, worse, worst = agreements(view.with_mask(detection.mask), model, [truth, turned, away], renderer, (160, 120))
     assert best.silhouette > 0.93 and best.colour > 0.65
     assert best.silhouette > worse.silhouette > worst.silhouette == 0
+    assert best.structure > 0.25 and best.structure > 1.5 * worse.structure and abs(worst.structure) < 0.05
     assert agreements(view, model, [truth], renderer, (160, 120))[0].silhouette == 1.0, "without a mask"
 
 

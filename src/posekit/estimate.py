@@ -9,27 +9,38 @@ from pathlib import Path
 
 import numpy as np
 
-from posekit.camera import Box
+from posekit.camera import Box, mask_box
 from posekit.contour import fit_contour
 from posekit.errors import ConfigError
 from posekit.geometry import Pose
-from posekit.hypotheses import Agreement, Hypothesis, MVNetSearch, TemplateSearch, agreements, poses_beside
+from posekit.hypotheses import (
+    Agreement,
+    Hypothesis,
+    MVNetSearch,
+    TemplateSearch,
+    agreement_of,
+    agreements,
+    poses_beside,
+)
 from posekit.nets.predictor import NetworkPredictor
 from posekit.nets.weights import load_networks
 from posekit.object_model import ObjectModel
-from posekit.refine import Refinement, RefineOptions, refine
+from posekit.refine import Refinement, RefineOptions, compare, refine
 from posekit.render import Renderer
 from posekit.results import Detection, Estimate
 from posekit.view import View
 
 INITS = ("templates", "mvnet")
+SILHOUETTE, STRUCTURE, VISIBLE, BIAS = 3.1, 15.4, 8.0, -10.5  # of `presence`, fitted: docs/decisions/0014
+USUAL = 0.86  # share of the object seen, where the network does not say
 HEATS, FINALISTS = 3, 2  # iterations after which only so many hypotheses go on
 BESIDE = float(np.deg2rad(12.0))  # how far from a known pose others are tried
 
 
 @dataclass(frozen=True)
 class EstimateOptions:
-    """init: where first poses come from. hypotheses: how many of them are refined. beside: whether poses beside a known
+    """init: where first poses come from. hypotheses: how many of them are refined, for each of a detection's masks.
+    beside: whether poses beside a known
     one are tried too where it does not converge at once. contour: whether the pose is laid onto the mask's outline
     where the mask proves exact. seed: for whatever is drawn at random. The rest is
     RefineOptions', with the angle in degrees."""
@@ -142,24 +153,27 @@ class PoseEstimator:
         return [heat if done else heat.then(next(ends)) for heat, done in zip(finalists, there, strict=True)]
 
     def first_poses(self, view: View, detection: Detection) -> list[Hypothesis]:
-        """The first poses that ``options.init`` gives, best first."""
+        """The first poses that ``options.init`` gives, best first; those for a detection's rough mask come last."""
         if self._search is None:
             self._search = TemplateSearch(self.model, self.renderer)
-        return self._search.search(view, detection, self.options.hypotheses)
+        found: list[Hypothesis] = []
+        for mask in (detection.mask, detection.rough):
+            if mask is not None or not found:
+                box = detection.box if mask is None or detection.rough is None else mask_box(mask) or detection.box
+                found += self._search.search(view, replace(detection, box=box, mask=mask), self.options.hypotheses)
+        return found
 
     def _choose(
         self, view: View, refined: Sequence[Refinement], detection: Detection | None, timings: dict[str, float]
     ) -> Estimate:
         """The hypothesis with the best score: a low predicted angle, and a silhouette that agrees with the mask."""
-        scores = self._scores(view, refined)
-        k = int(np.argmax(scores))
-        best = self._on_contour(view, refined[k])
+        best = self._on_contour(view, refined[int(np.argmax(self._scores(view, refined)))])
         return Estimate(
             T_cam_obj=best.T_cam_obj,
             angle=best.angle,
             iterations=best.iterations,
             converged=best.converged,
-            score=float(scores[k]),
+            score=self._presence(view, best.T_cam_obj),
             box=self._box(view, best.T_cam_obj),
             model=self.model.name,
             detection=detection,
@@ -177,6 +191,16 @@ class PoseEstimator:
         converged = fit.turn_std < self.options.refine_options.stop_angle
         return replace(refined, T_cam_obj=fit.T_cam_obj, angle=fit.turn_std, converged=converged)
 
+    def _presence(self, view: View, T_cam_obj: Pose) -> float:
+        """How sure it is that the photograph shows the object there: by what the network sees of it."""
+        outline = self.model.outline - self.model.center
+        [prediction], [observed], [rendered] = compare(
+            view, self.model, outline, [T_cam_obj], self.predictor, self.renderer
+        )
+        found = prediction.correspondences
+        visible = float(found.visible.mean()) if found is not None and len(found.visible) else USUAL
+        return presence(agreement_of(observed, rendered), visible)
+
     def _scores(self, view: View, refined: Sequence[Refinement]) -> list[float]:
         poses = [r.T_cam_obj for r in refined]
         measured = agreements(view, self.model, poses, self.renderer, self.predictor.size)
@@ -191,3 +215,11 @@ class PoseEstimator:
 def score(angle: float, agreement: Agreement) -> float:
     """Between 0 and 1, of a predicted angle (radians) and the agreement: see docs/decisions/0005."""
     return float(np.exp(-angle / np.deg2rad(30.0)) * (agreement.silhouette + 0.5 * max(0.0, agreement.colour)) / 1.5)
+
+
+def presence(agreement: Agreement, visible: float) -> float:
+    """Between 0 and 1: how likely it is that the object is there in this pose. visible: the mean probability that the
+    network gives to seeing what is rendered. A logistic function fitted to estimates of objects, shown and not shown,
+    in composed scenes: docs/decisions/0014."""
+    total = SILHOUETTE * agreement.silhouette + STRUCTURE * agreement.structure + VISIBLE * visible + BIAS
+    return float(1 / (1 + np.exp(-total)))

@@ -23,6 +23,7 @@ from posekit.camera import Camera
 from posekit.detect import Detector
 from posekit.detect.backbones import Lite0
 from posekit.detect.maskrcnn import COCO, SHIPPED, MaskRCNN, TrainedDetector, find, load_coco, load_detector
+from posekit.detect.sharpen import sharpened
 from posekit.detect.vision import torchvision
 from posekit.errors import ConfigError
 from posekit.geometry import Pose, fibonacci_sphere, view_rotation
@@ -98,7 +99,8 @@ class NovelDetector:
         if not models:
             return proposals
         looks = self._looks(view, proposals)
-        return [found for model in models for found in self._instances(view, model, proposals, looks)]
+        found = [each for model in models for each in self._instances(view, model, proposals, looks)]
+        return [sharpened(view.image, each) for each in found]
 
     def propose(self, view: View) -> list[Detection]:
         """Objects of any kind, by falling score."""

@@ -23,7 +23,8 @@ class Detection:
     """Where an object is in a picture.
 
     box: edges, pixels. mask: bool (H, W), of the picture's size, or None. score: in [0, 1]. label: the object's
-    name, where it is known. source: what found it, such as "box+grabcut" or "mask".
+    name, where it is known. source: what found it, such as "box+grabcut" or "mask". rough: a network's own mask, where
+    ``mask`` is that one laid onto the picture's colours: first poses are sought for both.
     """
 
     box: Box
@@ -31,6 +32,7 @@ class Detection:
     score: float = 1.0
     label: str | None = None
     source: str = "box"
+    rough: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,6 +19,7 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from posekit.detect.backbones import BACKBONES, feature_pyramid
+from posekit.detect.sharpen import sharpened
 from posekit.detect.vision import torchvision
 from posekit.errors import ConfigError, WeightsError
 from posekit.files import write_bytes_atomic, write_text_atomic
@@ -26,7 +27,7 @@ from posekit.object_model import ObjectModel
 from posekit.results import Detection
 from posekit.view import View
 
-KIND = "mask-rcnn"
+KIND = SOURCE = "mask-rcnn"
 NOVEL = ("object",)  # the one class of a class-agnostic detector
 SHIPPED = Path(__file__).resolve().parent.parent / "weights" / "detector-novel"
 COCO = "coco"
@@ -254,7 +255,7 @@ class MaskRCNN:
         names = [classes[k] for k in found.labels]
         wanted = {m.name for m in models} or set(classes)
         return [
-            Detection(_box(found.boxes[k]), found.masks[k], float(found.scores[k]), name, "mask-rcnn")
+            sharpened(view.image, Detection(_box(found.boxes[k]), found.masks[k], float(found.scores[k]), name, SOURCE))
             for k, name in enumerate(names)
             if name in wanted
         ]

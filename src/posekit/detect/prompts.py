@@ -120,7 +120,7 @@ def grabcut_mask(image: NDArray[np.uint8], box: Box) -> Mask | None:
     cv2.setRNGSeed(0)
     models = np.zeros((2, 1, 65))
     cv2.grabCut(small[..., ::-1].copy(), labels, None, models[0], models[1], _ROUNDS, cv2.GC_INIT_WITH_MASK)
-    found = _largest_blob((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD))
+    found = largest_blob((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD))
     if not _fills(found, inner):
         return None
     mask = np.zeros(image.shape[:2], dtype=np.bool_)
@@ -157,7 +157,7 @@ def _first_labels(inner: tuple[int, int, int, int], size: tuple[int, int]) -> ND
     return labels
 
 
-def _largest_blob(mask: Mask) -> Mask:
+def largest_blob(mask: Mask) -> Mask:
     """The largest connected part without specks, fringes and holes."""
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
     smooth = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, kernel)
