@@ -299,7 +299,7 @@ class _Estimator:
     def __init__(self, scores: list[float], boxes: list[tuple[float, float, float, float]]) -> None:
         self.found = [Estimate(Pose.identity(), 0.0, 1, True, s, b, "m") for s, b in zip(scores, boxes, strict=True)]
 
-    def estimate(self, view: View, detections: list[Detection]) -> list[Estimate]:
+    def estimate(self, view: View, detections: list[Detection], least: float = 0.0) -> list[Estimate]:
         return self.found[: len(detections)]
 
 

@@ -184,6 +184,8 @@ def test_what_is_not_there_is_doubted(examples) -> None:
     detection = masked(PoseEstimator(example.model).renderer, example)
     [shown], [absent] = (PoseEstimator(m).estimate(example.view, [detection]) for m in (example.model, other))
     assert shown.score > 0.8 > 0.4 > absent.score
+    [again] = PoseEstimator(other).estimate(example.view, [detection], 1.0)
+    assert again.score < 0.5 and again.iterations == 3 and not again.converged, "not refined to the end"
     assert presence(Agreement(0.9, 0.5, 0.2), 0.9) > presence(Agreement(0.9, 0.5, 0.1), 0.9)
     assert presence(Agreement(0.9, 0.5, 0.2), 0.9) > presence(Agreement(0.9, 0.5, 0.2), 0.7)
     assert presence(Agreement(0.9, 0.5, 0.2), 0.9) > presence(Agreement(0.6, 0.5, 0.2), 0.9)

@@ -74,7 +74,7 @@ class Estimator:
     def __init__(self, model: ObjectModel, renderer: Renderer, found: Pose | None = None, score: float = 0.9) -> None:
         self.model, self.renderer, self.found, self.score = model, renderer, found, score
 
-    def estimate(self, view: View, detections: Sequence[Detection]) -> list[Estimate]:
+    def estimate(self, view: View, detections: Sequence[Detection], least: float = 0.0) -> list[Estimate]:
         if self.found is None:
             return []
         return [Estimate(self.found, 0.1, 3, True, self.score, d.box, self.model.name, d) for d in detections]

@@ -33,7 +33,7 @@ from posekit.view import View
 INITS = ("templates", "mvnet")
 SILHOUETTE, STRUCTURE, VISIBLE, BIAS = 3.1, 15.4, 8.0, -10.5  # of `presence`, fitted: docs/decisions/0014
 USUAL = 0.86  # share of the object seen, where the network does not say
-HEATS, FINALISTS = 3, 2  # iterations after which only so many hypotheses go on
+FIRST, SEMIFINALISTS, HEATS, FINALISTS = 1, 4, 3, 2  # iterations after which only so many hypotheses go on
 BESIDE = float(np.deg2rad(12.0))  # how far from a known pose others are tried
 
 
@@ -99,8 +99,9 @@ class PoseEstimator:
     def weights_hash(self) -> str:
         return self.networks.digest
 
-    def estimate(self, view: View, detections: Sequence[Detection]) -> list[Estimate]:
-        """One estimate for each detection that gives a silhouette to start from, in their order."""
+    def estimate(self, view: View, detections: Sequence[Detection], least: float = 0.0) -> list[Estimate]:
+        """One estimate for each detection that gives a silhouette to start from, in their order. least: the score that
+        is asked for; what has not half of it after a few iterations is not refined to the end."""
         estimates = []
         for detection in detections:
             started = time.perf_counter()
@@ -109,7 +110,7 @@ class PoseEstimator:
             if not first:
                 continue
             masked = view.with_mask(detection.mask) if detection.mask is not None else view.with_mask(None)
-            refined = self._refined(masked, [h.T_cam_obj for h in first])
+            refined = self._refined(masked, [h.T_cam_obj for h in first], 0.5 * least)
             done = time.perf_counter()
             timings = {"first_pose": searched - started, "refine": done - searched, "total": done - started}
             estimates.append(self._choose(masked, refined, detection, timings))
@@ -130,27 +131,37 @@ class PoseEstimator:
         seconds = time.perf_counter() - started
         return self._choose(view, refined, None, {"refine": seconds, "total": seconds})
 
-    def _refined(self, view: View, starts: Sequence[Pose]) -> list[Refinement]:
-        """Every start for a few iterations, and the best of them to the end."""
+    def _refined(self, view: View, starts: Sequence[Pose], least: float) -> list[Refinement]:
+        """Every start for a few iterations, and the best of them to the end, unless its score is below ``least``."""
         options = self.options.refine_options
         if len(starts) <= FINALISTS or options.iterations <= HEATS:
             return refine(view, self.model, starts, self.predictor, self.renderer, options)
-        return self._finals(view, self._heats(view, starts))
+        heats = self._best(view, self._heats(view, starts, FIRST), SEMIFINALISTS)
+        heats = self._onward(view, heats, HEATS - FIRST)
+        if least > 0 and self._presence(view, self._best(view, heats, 1)[0].T_cam_obj) < least:
+            return heats
+        return self._finals(view, heats)
 
-    def _heats(self, view: View, starts: Sequence[Pose]) -> list[Refinement]:
-        short = replace(self.options.refine_options, iterations=HEATS)
+    def _heats(self, view: View, starts: Sequence[Pose], iterations: int = HEATS) -> list[Refinement]:
+        short = replace(self.options.refine_options, iterations=iterations)
         return refine(view, self.model, starts, self.predictor, self.renderer, short)
 
     def _finals(self, view: View, heats: Sequence[Refinement]) -> list[Refinement]:
-        """The best go on; with the paper's policy only where they have not converged."""
-        options = self.options.refine_options
+        """The best go on to the end."""
+        finalists = self._best(view, heats, FINALISTS)
+        return self._onward(view, finalists, self.options.refine_options.iterations - HEATS)
+
+    def _best(self, view: View, heats: Sequence[Refinement], count: int) -> list[Refinement]:
         order = np.argsort([-s for s in self._scores(view, heats)], kind="stable")
-        finalists = [heats[k] for k in order[:FINALISTS]]
-        there = [heat.converged and options.stop == "angle" for heat in finalists]
-        poses = [heat.T_cam_obj for heat, done in zip(finalists, there, strict=True) if not done]
-        rest = replace(options, iterations=options.iterations - HEATS)
-        ends = iter(refine(view, self.model, poses, self.predictor, self.renderer, rest))
-        return [heat if done else heat.then(next(ends)) for heat, done in zip(finalists, there, strict=True)]
+        return [heats[k] for k in order[:count]]
+
+    def _onward(self, view: View, heats: Sequence[Refinement], iterations: int) -> list[Refinement]:
+        """So many more; with the paper's policy only for what has not converged."""
+        options = replace(self.options.refine_options, iterations=iterations)
+        there = [heat.converged and options.stop == "angle" for heat in heats]
+        poses = [heat.T_cam_obj for heat, done in zip(heats, there, strict=True) if not done]
+        ends = iter(refine(view, self.model, poses, self.predictor, self.renderer, options))
+        return [heat if done else heat.then(next(ends)) for heat, done in zip(heats, there, strict=True)]
 
     def first_poses(self, view: View, detection: Detection) -> list[Hypothesis]:
         """The first poses that ``options.init`` gives, best first; those for a detection's rough mask come last."""

@@ -35,7 +35,7 @@ def estimate_instances(
     estimator: PoseEstimator, view: View, detections: Sequence[Detection], options: SearchOptions = SearchOptions()
 ) -> list[Estimate]:
     """The instances among an object's detections, best first; none is an empty list."""
-    found = sorted(estimator.estimate(view, detections), key=lambda e: -e.score)
+    found = sorted(estimator.estimate(view, detections, options.least), key=lambda e: -e.score)
     kept: list[Estimate] = []
     for each in found:
         if each.score >= options.least and all(box_overlap(each.box, k.box) < options.overlap for k in kept):

@@ -345,7 +345,7 @@ class Tracker:
             return Tracked(LOST)
         self._waiting = self.config.search
         detections = [d for d in self.detector.detect(view, [self.model]) if d.label in (None, self.model.name)]
-        found = max(self.estimator.estimate(view, detections), key=lambda e: e.score, default=None)
+        found = max(self.estimator.estimate(view, detections, self.config.first), key=lambda e: e.score, default=None)
         if found is None or found.score < self.config.first or not self._begin(view, found.T_cam_obj, found.angle):
             return Tracked(LOST)
         self._waiting = 0
