@@ -31,8 +31,8 @@ from posekit.results import Detection, Estimate
 from posekit.view import View
 
 INITS = ("templates", "mvnet")
-SILHOUETTE, STRUCTURE, VISIBLE, BIAS = 3.1, 15.4, 8.0, -10.5  # of `presence`, fitted: docs/decisions/0014
-USUAL = 0.86  # share of the object seen, where the network does not say
+SILHOUETTE, STRUCTURE, BLUR, BIAS = 4.1, 8.0, 3.0, -2.3  # of `presence`, fitted: docs/decisions/0014
+USUAL = 2.0  # pixels of the crop: the correspondences' expected error, where the network gives none
 FIRST, SEMIFINALISTS, HEATS, FINALISTS = 1, 4, 3, 2  # iterations after which only so many hypotheses go on
 BESIDE = float(np.deg2rad(12.0))  # how far from a known pose others are tried
 
@@ -209,8 +209,8 @@ class PoseEstimator:
             view, self.model, outline, [T_cam_obj], self.predictor, self.renderer
         )
         found = prediction.correspondences
-        visible = float(found.visible.mean()) if found is not None and len(found.visible) else USUAL
-        return presence(agreement_of(observed, rendered), visible)
+        error = float(np.median(found.scale_px)) if found is not None and len(found.scale_px) else USUAL
+        return presence(agreement_of(observed, rendered), error)
 
     def _scores(self, view: View, refined: Sequence[Refinement]) -> list[float]:
         poses = [r.T_cam_obj for r in refined]
@@ -228,9 +228,9 @@ def score(angle: float, agreement: Agreement) -> float:
     return float(np.exp(-angle / np.deg2rad(30.0)) * (agreement.silhouette + 0.5 * max(0.0, agreement.colour)) / 1.5)
 
 
-def presence(agreement: Agreement, visible: float) -> float:
-    """Between 0 and 1: how likely it is that the object is there in this pose. visible: the mean probability that the
-    network gives to seeing what is rendered. A logistic function fitted to estimates of objects, shown and not shown,
-    in composed scenes: docs/decisions/0014."""
-    total = SILHOUETTE * agreement.silhouette + STRUCTURE * agreement.structure + VISIBLE * visible + BIAS
+def presence(agreement: Agreement, error_px: float) -> float:
+    """Between 0 and 1: how likely it is that the object is there in this pose. error_px: median of the errors that the
+    network expects of its correspondences, pixels of the crop. A logistic function fitted to estimates of objects,
+    shown and not shown, in composed scenes: docs/decisions/0014."""
+    total = SILHOUETTE * agreement.silhouette + STRUCTURE * agreement.structure - BLUR * np.log(error_px) + BIAS
     return float(1 / (1 + np.exp(-total)))
