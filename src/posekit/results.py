@@ -48,8 +48,8 @@ class Estimate:
     """An object's pose in a photograph.
 
     angle: predicted rotation error, radians. iterations: used for this result. converged: whether the angle fell
-    below the threshold. score: in [0, 1], higher is better. box: of the object at this pose, edges, pixels.
-    model: the mesh's name. detection: what it started from. trace: the poses on the way, first to last.
+    below the threshold. score: in [0, 1], how likely the object is there in this pose. box: of the object at this pose,
+    edges, pixels. model: the mesh's name. detection: what it started from. trace: the poses on the way, first to last.
     timings: seconds by stage.
     """
 
