@@ -15,7 +15,7 @@ from objects import bracket
 from posekit.camera import Camera
 from posekit.cli.app import app
 from posekit.data.tabletop import TabletopConfig, procedural_objects
-from posekit.data.tabletop_stream import TabletopStream, TabletopStreamConfig
+from posekit.data.tabletop_stream import TabletopStream, TabletopStreamConfig, labelled_scenes
 from posekit.detect.coco import Truth, average_precision
 from posekit.detect.external import DetectionsFile, categories_of, to_bop, to_coco
 from posekit.detect.maskrcnn import (
@@ -39,7 +39,7 @@ from posekit.object_model import ObjectModel
 from posekit.render import Renderer
 from posekit.results import Detection, Estimate
 from posekit.search import SearchOptions, box_overlap, estimate_instances
-from posekit.train.config import MachineConfig, OptimiserConfig, write_config
+from posekit.train.config import MachineConfig, OptimiserConfig, SourceConfig, write_config
 from posekit.train.detector import DetectorConfig, DetectorModule, read_config, target, train_detector
 from posekit.view import View
 
@@ -159,6 +159,33 @@ def test_a_batch_is_a_function_of_its_number_and_its_targets_fit() -> None:
     for box, mask in zip(found["boxes"].int().tolist(), found["masks"], strict=True):
         x0, y0, x1, y1 = box
         assert mask[y0:y1, x0:x1].sum() == mask.sum() and mask[y0].any() and mask[y1 - 1].any()
+
+
+def test_distractors_lie_about_and_belong_to_the_ground(renderer: Renderer, tmp_path: Path) -> None:
+    grey, green = (
+        ObjectModel.from_arrays(bracket().vertices, bracket().faces, name=name,
+                                colors=np.tile(np.array(colour, np.uint8), (len(bracket().vertices), 1)))
+        for name, colour in (("grey", (128, 128, 128)), ("green", (0, 255, 0)))
+    )  # fmt: skip
+    scenes = dataclasses.replace(SCENES.scenes, distractors=(4, 6))
+    config = dataclasses.replace(SCENES, meshes=8, per_block=6, scenes=scenes)
+
+    def greens(distractors: list[ObjectModel]) -> int:
+        rng, count = np.random.default_rng(3), 0
+        for scene in labelled_scenes(renderer, [grey], False, 6, config, rng, [], distractors):
+            pixels = scene.image.astype(int)
+            is_green = (pixels[..., 1] > 3 * pixels[..., 0]) & (pixels[..., 1] > 3 * pixels[..., 2])
+            shown = [k for k in range(len(scene.classes)) if (scene.labels == k + 1).any()]
+            found = [k for k in shown if is_green[scene.labels == k + 1].mean() > 0.7]
+            assert all(scene.classes[k] == -1 for k in found)
+            count += len(found)
+        return count
+
+    assert greens([green]) >= greens([]) + 3
+    _write_ply(tmp_path / "box.ply")
+    sources = SourceConfig(models=(str(tmp_path / "box.ply"),), units="m", distractors=(str(tmp_path),))
+    with pytest.raises(ConfigError, match="any kind"):
+        train_detector(dataclasses.replace(DetectorConfig(), agnostic=True, sources=sources), tmp_path / "out")
 
 
 def test_one_batch_is_learned() -> None:

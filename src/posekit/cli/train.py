@@ -244,6 +244,12 @@ def detector(
     agnostic: Annotated[
         bool, typer.Option("--agnostic", help="Objects of any kind, as one class.", rich_help_panel=SOURCES)
     ] = False,
+    distractors: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="DIR", help="A folder of meshes that lie about, not to be found.", rich_help_panel=SOURCES
+        ),
+    ] = None,
     units: Annotated[Units | None, typer.Option(help="Of the meshes; auto.", rich_help_panel=SOURCES)] = None,
     backgrounds: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Photographs for backgrounds.", rich_help_panel=SOURCES)
@@ -299,8 +305,9 @@ def detector(
                         "threads": threads},
             "stream": {"batch": batch},
             "network": {"backbone": backbone},
-            "sources": {"models": _texts(models), "meshes": _texts(meshes), "units": units,
-                        "backgrounds": _text(backgrounds), "init": str(SHIPPED) if init == "novel" else init},
+            "sources": {"models": _texts(models), "meshes": _texts(meshes), "distractors": _texts(distractors),
+                        "units": units, "backgrounds": _text(backgrounds),
+                        "init": str(SHIPPED) if init == "novel" else init},
         }  # fmt: skip
         with _bar() as show:
             rows = train_detector(changed(chosen, _given(asked), "the command line"), out, show, force)

@@ -57,16 +57,18 @@ class LabelledImage:
 
 def labelled_scenes(
     renderer: Renderer, models: Sequence[ObjectModel], agnostic: bool, count: int, config: TabletopStreamConfig,
-    rng: Rng, photos: Sequence[Image],
+    rng: Rng, photos: Sequence[Image], distractors: Sequence[ObjectModel] = (),
 ) -> list[LabelledImage]:  # fmt: skip
     """``count`` scenes over one set of fresh procedural meshes.
 
     agnostic: everything is of class 0, procedural meshes too; else classes are the models' numbers, and procedural
-    meshes belong to the ground.
+    meshes belong to the ground, as do the distractors that take the place of half of them.
     """
     unit = UNIT if agnostic else float(np.median([m.diameter for m in models]))
     others = procedural_objects(config.meshes, rng, photos, unit)
     shown = _mixed(models, others, rng) if agnostic else models
+    if distractors and not agnostic:
+        others = _mixed(distractors, others, rng)
     found: list[LabelledImage] = []
     while len(found) < count:
         scene = compose(renderer, shown, config.scenes, rng, distractors=others, photos=photos)
@@ -94,8 +96,10 @@ class TabletopStream(IterableDataset[Batch]):
     """
 
     def __init__(self, config: TabletopStreamConfig, seed: int, models: Sequence[ObjectModel] = (), *, agnostic: bool,
-                 photos: Sequence[Image] = (), start: int = 0, rank: int = 0) -> None:  # fmt: skip
+                 photos: Sequence[Image] = (), distractors: Sequence[ObjectModel] = (), start: int = 0, rank: int = 0
+                 ) -> None:  # fmt: skip
         self.config, self.seed, self.models, self.agnostic = config, seed, models, agnostic
+        self.distractors = distractors
         self.photos, self.start, self.rank = photos, start, rank
 
     def __iter__(self) -> Iterator[Batch]:
@@ -104,7 +108,8 @@ class TabletopStream(IterableDataset[Batch]):
 
         def block(number: int) -> list[LabelledImage]:
             rng = np.random.default_rng([self.seed, SCENES, OBJECTS, self.rank, lane, number])
-            return labelled_scenes(renderer, self.models, self.agnostic, config.per_block, config, rng, self.photos)
+            return labelled_scenes(renderer, self.models, self.agnostic, config.per_block, config, rng, self.photos,
+                                   self.distractors)  # fmt: skip
 
         most = max(1, config.pool // config.per_block)
         blocks = Window(block, max(1, most // 4), most, config.batch / config.reuse / config.per_block)

@@ -74,7 +74,8 @@ class MachineConfig:
 class SourceConfig:
     """What is trained on. models: mesh files. meshes: folders of mesh files. bop: folders in BOP layout with a weight
     each, as ``FOLDER``, ``FOLDER:SPLIT`` or ``FOLDER:SPLIT=WEIGHT`` (paper recipe). renders: weight of renderings
-    beside them. backgrounds: a folder of photographs. init: weights to start from; empty = none. flownets: a FlowNetS
+    beside them. distractors: folders of meshes that lie about in a detector's scenes and are not to be found.
+    backgrounds: a folder of photographs. init: weights to start from; empty = none. flownets: a FlowNetS
     checkpoint for the paper's encoder. validate_on: a folder in BOP layout."""
 
     models: tuple[str, ...] = ()
@@ -82,6 +83,7 @@ class SourceConfig:
     meshes: tuple[str, ...] = ()
     bop: tuple[str, ...] = ()
     renders: float = 1.0
+    distractors: tuple[str, ...] = ()
     backgrounds: str = ""
     init: str = ""
     flownets: str = ""

@@ -134,6 +134,8 @@ def _train(config: DetectorConfig, out: Path, show: Show | None) -> list[dict[st
     sources = read_sources(config.sources)
     if not config.agnostic and not sources.models:
         raise ConfigError("a detector is trained for meshes: pass --models MESH ..., or --agnostic for any object.")
+    if config.agnostic and sources.distractors:
+        raise ConfigError("an agnostic detector finds objects of any kind: pass --meshes instead of --distractors.")
     torch.manual_seed(config.seed)  # the same new networks in every process
     config = dataclasses.replace(config, network=dataclasses.replace(config.network, classes=_classes(config, sources)))
     task = DetectorTask(config, sources)
@@ -207,7 +209,8 @@ class DetectorTask:
 
     def stream(self, start: int, rank: int) -> IterableDataset[Batch]:
         return TabletopStream(self.config.stream, self.config.seed, self.sources.models, agnostic=self.config.agnostic,
-                              photos=self.sources.photos, start=start, rank=rank)  # fmt: skip
+                              photos=self.sources.photos, distractors=self.sources.distractors, start=start,
+                              rank=rank)  # fmt: skip
 
     def prepare(self, batches: Callable[[int], Iterator[Batch]]) -> None:
         """Nothing has to be measured before."""
@@ -234,7 +237,7 @@ class DetectorTask:
         while len(scenes) < self.config.scenes:
             count = min(stream.per_block, self.config.scenes - len(scenes))
             scenes += labelled_scenes(renderer, self.sources.models, self.config.agnostic, count, stream, rng,
-                                      self.sources.photos)  # fmt: skip
+                                      self.sources.photos, self.sources.distractors)  # fmt: skip
         return [photographed(scene, stream.augment, rng) for scene in scenes]
 
 

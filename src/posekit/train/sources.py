@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,13 +23,15 @@ MESHES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
 @dataclass(frozen=True, eq=False)
 class Sources:
     """models: the meshes to render; none = procedural ones. photos: backgrounds. bop: data sets with their weights.
-    validation: a data set to measure on. folders: where models came from, with how many each."""
+    validation: a data set to measure on. folders: where models came from, with how many each. distractors: meshes
+    beside them, in any unit."""
 
     models: list[ObjectModel]
     photos: list[NDArray[np.uint8]]
     bop: list[tuple[BopDataset, float]]
     validation: BopDataset | None
     folders: tuple[tuple[str, int], ...] = ()
+    distractors: Sequence[ObjectModel] = ()
 
     def about(self, share: float) -> str:
         """A line for the weights' description. share: of samples that show the models."""
@@ -64,7 +67,9 @@ def read_sources(config: SourceConfig) -> Sources:
     if backgrounds is not None and not photos:
         raise ConfigError(f"the folder {backgrounds} holds no JPEG, PNG or WebP pictures for backgrounds.")
     validation = BopDataset(config.validate_on) if config.validate_on else None
-    return Sources(models, photos, [_weighted(text) for text in config.bop], validation, tuple(folders))
+    distractors = [model for folder in config.distractors for model in _meshes(Path(folder), "m")]
+    bop = [_weighted(text) for text in config.bop]
+    return Sources(models, photos, bop, validation, tuple(folders), distractors)
 
 
 def _meshes(folder: Path, units: str) -> list[ObjectModel]:
