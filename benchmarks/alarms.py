@@ -48,7 +48,7 @@ def main() -> None:
         scores.append(best[0].score if best else 0.0)
         print(f"{pictures[k]} {model.name}: {len(found)} detections, best estimate {scores[-1]:.2f}", flush=True)
     usual = SearchOptions().least
-    for least in sorted({usual, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9}):
+    for least in sorted({usual, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 0.9}):
         alarms = sum(score >= least for score in scores)
         print(f"score from {least:g}{' (default)' if least == usual else ''}: found in {alarms} of {len(scores)}")
     detect, estimate = np.mean(seconds[1:] or seconds, axis=0)

@@ -18,7 +18,7 @@ class SearchOptions:
     boxes (intersection over union) from which two estimates are of one instance."""
 
     instances: int = 1
-    least: float = 0.4
+    least: float = 0.5
     overlap: float = 0.5
 
     def __post_init__(self) -> None:

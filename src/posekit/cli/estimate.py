@@ -48,7 +48,7 @@ LeastOption = Annotated[
     typer.Option(
         min=0,
         max=1,
-        help="Least score of an estimate; by default 0 where you say where the object is, else 0.4.",
+        help="Least score of an estimate; by default 0 where you say where the object is, else 0.5.",
         rich_help_panel=LOOP,
     ),
 ]
