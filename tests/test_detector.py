@@ -38,7 +38,7 @@ from posekit.novel import NovelDetector
 from posekit.object_model import ObjectModel
 from posekit.render import Renderer
 from posekit.results import Detection, Estimate
-from posekit.search import SearchOptions, box_overlap, estimate_instances
+from posekit.search import SearchOptions, box_overlap, estimate_instances, judged
 from posekit.train.config import MachineConfig, OptimiserConfig, SourceConfig, write_config
 from posekit.train.detector import DetectorConfig, DetectorModule, read_config, target, train_detector
 from posekit.view import View
@@ -345,7 +345,22 @@ def test_instances_are_what_scores_and_does_not_overlap() -> None:
     assert box_overlap(boxes[0], boxes[1]) == pytest.approx(9 / 11)
 
 
+def test_detections_are_judged_by_their_poses() -> None:
+    a, b, c = (Detection((k, 0.0, k + 10.0, 10.0), score=0.9 - 0.1 * k, label="m") for k in range(3))
+    estimates = [
+        Estimate(Pose.identity(), 0.0, 1, True, score, found.box, "m", found) for score, found in ((0.2, a), (0.7, b))
+    ]
+    found = judged([a, b, c], estimates)
+    assert [(d.box, d.score) for d in found] == [(b.box, 0.7), (a.box, 0.2), (c.box, 0.0)]
+
+
 # --- commands -----------------------------------------------------------------------------------------------------
+
+
+def test_nothing_can_be_verified_without_a_mesh(tmp_path: Path) -> None:
+    (tmp_path / "grey.png").write_bytes(png(np.full((240, 320, 3), 128, np.uint8)))
+    result = CliRunner().invoke(app, ["detect", str(tmp_path / "grey.png"), "--verify", "--out", str(tmp_path / "o")])
+    assert result.exit_code == 1 and "--model MESH" in result.output and not (tmp_path / "o").exists()
 
 
 def test_detect_and_estimate_where_nothing_is(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from posekit.camera import Box
 from posekit.errors import ConfigError
@@ -35,12 +35,23 @@ def estimate_instances(
     estimator: PoseEstimator, view: View, detections: Sequence[Detection], options: SearchOptions = SearchOptions()
 ) -> list[Estimate]:
     """The instances among an object's detections, best first; none is an empty list."""
-    found = sorted(estimator.estimate(view, detections, options.least), key=lambda e: -e.score)
+    return instances_of(estimator.estimate(view, detections, options.least), options)
+
+
+def instances_of(estimates: Sequence[Estimate], options: SearchOptions = SearchOptions()) -> list[Estimate]:
+    """Those of an object's estimates that are instances of it, best first."""
     kept: list[Estimate] = []
-    for each in found:
+    for each in sorted(estimates, key=lambda e: -e.score):
         if each.score >= options.least and all(box_overlap(each.box, k.box) < options.overlap for k in kept):
             kept.append(each)
     return kept[: options.instances] if options.instances else kept
+
+
+def judged(detections: Sequence[Detection], estimates: Sequence[Estimate]) -> list[Detection]:
+    """The detections with the scores of the estimates that they led to, best first; 0 for one that led to none."""
+    scores = {id(each.detection): each.score for each in estimates}
+    found = [replace(detection, score=scores.get(id(detection), 0.0)) for detection in detections]
+    return sorted(found, key=lambda d: -d.score)
 
 
 def box_overlap(a: Box, b: Box) -> float:

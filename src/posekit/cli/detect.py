@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -19,6 +20,11 @@ from posekit.cli.options import (
     ThreadsOption,
     UnitsOption,
 )
+
+if TYPE_CHECKING:
+    from posekit.object_model import ObjectModel
+    from posekit.results import Detection
+    from posekit.view import View
 
 SCORES = "Detections"
 
@@ -43,6 +49,13 @@ def detect(
     ] = None,
     least: Annotated[float | None, typer.Option(min=0, max=1, help="Least score.", rich_help_panel=SCORES)] = None,
     most: Annotated[int, typer.Option(min=1, help="Detections of a mesh at most (novel).", rich_help_panel=SCORES)] = 3,
+    verify: Annotated[
+        bool | None,
+        typer.Option(
+            help="Score by the poses found there, a second each; by default with --model and the novel detector.",
+            rich_help_panel=SCORES,
+        ),
+    ] = None,
     threads: ThreadsOption = None,
     scene: Annotated[
         int | None, typer.Option(help="scene_id for BOP; by default the folder's number.", rich_help_panel=OUTPUT)
@@ -57,9 +70,12 @@ def detect(
     from posekit.errors import ConfigError
     from posekit.figures import detections_overlay
     from posekit.load import load_view
-    from posekit.novel import make_detector
+    from posekit.novel import NovelDetector, NovelOptions, make_detector
     from posekit.object_model import ObjectModel
+    from posekit.search import SearchOptions
 
+    if verify and not model:
+        raise ConfigError("--verify looks for poses of meshes: pass --model MESH, or leave it out.")
     if weights is not None and detector is not None:
         raise ConfigError("--weights and --detector were both given, and mean the same: pass one of them.")
     folder = OutputFolder(out or Path("posekit-out") / f"{image.stem}-detections", force)
@@ -68,8 +84,13 @@ def detect(
     finder, classes = make_detector(
         str(weights) if weights is not None else detector, meshes, least=least, most=most, threads=threads
     )
+    verify = isinstance(finder, NovelDetector) and bool(meshes) if verify is None else verify
+    if verify and isinstance(finder, NovelDetector):  # the poses are asked for the least score, not the looks
+        finder = NovelDetector(finder.detector, finder.renderer, NovelOptions(most=most))
     started = time.perf_counter()
     found = sorted(finder.detect(view, meshes), key=lambda d: -d.score)
+    if verify:
+        found = _verified(view, found, meshes, SearchOptions().least if least is None else least, threads)
     seconds = time.perf_counter() - started
     for detection in found:
         typer.echo(
@@ -83,3 +104,18 @@ def detect(
     typer.echo(f"overlay: {folder.write('overlay.png', png(detections_overlay(view, found)))}")
     typer.echo(f"COCO: {folder.write('coco.json', to_coco(found, classes, image, view.camera.size))}")
     typer.echo(f"BOP: {folder.write('bop.json', to_bop(found, classes, image, seconds, scene))}")
+
+
+def _verified(
+    view: View, found: Sequence[Detection], meshes: Sequence[ObjectModel], least: float, threads: int | None
+) -> list[Detection]:
+    """What a pose speaks for, best first, scored by it."""
+    from posekit.estimate import PoseEstimator
+    from posekit.search import judged
+
+    kept = []
+    for mesh in meshes:
+        mine = [d for d in found if d.label == mesh.name]
+        estimates = PoseEstimator(mesh, threads=threads).estimate(view, mine, least) if mine else []
+        kept += [d for d in judged(mine, estimates) if d.score >= least]
+    return sorted(kept, key=lambda d: -d.score)

@@ -27,9 +27,9 @@ from posekit.evaluate.tracking import Sequences
 from posekit.evaluate.truths import Truth, TruthReader, selected
 from posekit.geometry import Pose
 from posekit.metrics import box_iou
-from posekit.novel import make_detector
+from posekit.novel import ANY, make_detector
 from posekit.results import Detection, Estimate
-from posekit.search import SearchOptions, estimate_instances
+from posekit.search import SearchOptions, instances_of, judged
 from posekit.view import View
 
 Record = dict[str, Any]
@@ -126,7 +126,8 @@ class ImageStage:
 
     def _detected(self, view: View, scene: int, image: int) -> tuple[list[Record], list[FoundRegion]]:
         """Estimates from what the detector finds of the data set's objects, and the detections. As `posekit estimate`
-        does, only what the render bears out is kept, but any number of instances."""
+        does, only what the render bears out is kept, but any number of instances; novel objects' detections are
+        scored by the poses that they lead to."""
         numbers = self.options.objects or tuple(self.data.model_ids())
         models = {obj_id: self.data.model(obj_id) for obj_id in numbers}
         if self._detector is None:
@@ -139,8 +140,13 @@ class ImageStage:
         entries, regions = [], []
         for obj_id, model in models.items():
             mine = [d for d in found if d.label == model.name]
-            regions += [_region(d, scene, image, obj_id, seconds) for d in mine]
-            for estimate in estimate_instances(self._estimator(obj_id), view, mine, SearchOptions(instances=0)):
+            options = SearchOptions(instances=0)
+            estimates = self._estimator(obj_id).estimate(view, mine, options.least)
+            if any(d.source == ANY for d in mine):
+                regions += [_region(d, scene, image, obj_id, seconds) for d in judged(mine, estimates)]
+            else:
+                regions += [_region(d, scene, image, obj_id, seconds) for d in mine]
+            for estimate in instances_of(estimates, options):
                 assert estimate.detection is not None
                 entries.append(_entry(estimate, obj_id, None) | {"detection_score": estimate.detection.score})
         return entries, regions
