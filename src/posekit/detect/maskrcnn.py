@@ -18,7 +18,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
-from posekit.detect.backbones import BACKBONES, feature_pyramid
+from posekit.detect.backbones import BACKBONES, LITE0_MEAN, LITE0_STD, feature_pyramid
 from posekit.detect.sharpen import sharpened
 from posekit.detect.vision import torchvision
 from posekit.errors import ConfigError, WeightsError
@@ -89,7 +89,7 @@ def build(config: MaskRCNNConfig, *, imagenet: bool = False) -> Any:
     lite = config.backbone == "lite0"
     return detection.MaskRCNN(
         body, min_size=min(width, height), max_size=max(width, height),
-        image_mean=[0.498] * 3 if lite else None, image_std=[0.502] * 3 if lite else None,
+        image_mean=[LITE0_MEAN] * 3 if lite else None, image_std=[LITE0_STD] * 3 if lite else None,
         rpn_anchor_generator=shapes, rpn_pre_nms_top_n_train=3 * config.proposals[0], rpn_pre_nms_top_n_test=
         3 * config.proposals[1], rpn_post_nms_top_n_train=config.proposals[0], rpn_post_nms_top_n_test=
         config.proposals[1], rpn_batch_size_per_image=128,
