@@ -98,7 +98,7 @@ class NovelDetector:
     def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
         """The instances of the models, each model's best first; with no models, whatever looks like an object."""
         proposals = self.propose(view)
-        if not models:
+        if not models or not proposals:
             return proposals
         looks = self._looks(view, proposals)
         found = [each for model in models for each in self._instances(view, model, proposals, looks)]
@@ -122,7 +122,7 @@ class NovelDetector:
 
     def similarities(self, view: View, model: ObjectModel, proposals: Sequence[Detection]) -> list[float]:
         """How much each proposal looks like the mesh, in [0, 1]."""
-        return self._similarities(view, model, proposals, self._looks(view, proposals))
+        return self._similarities(view, model, proposals, self._looks(view, proposals)) if proposals else []
 
     def _similarities(
         self, view: View, model: ObjectModel, proposals: Sequence[Detection], looks: _Looks
@@ -183,8 +183,6 @@ class NovelDetector:
 
     def _features(self, pictures: Sequence[View]) -> FArray:
         """ImageNet's features over each silhouette, (N, C), each level's of unit length."""
-        if not pictures:
-            return np.zeros((0, 0), np.float32)
         images = torch.from_numpy(np.stack([p.image for p in pictures])).permute(0, 3, 1, 2).float() / 255
         masks = torch.from_numpy(np.stack([p.mask for p in pictures if p.mask is not None])).float()[:, None]
         pooled = []

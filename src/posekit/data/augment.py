@@ -27,7 +27,8 @@ class AugmentConfig:
     paper's are always too large, and a network that learned from such masks alone takes an exact one for too large
     and the object for smaller and further away than it is. no_mask, box_mask, cut_mask: shares of masks left out,
     replaced by the filled box, and cut in part. source_mask: share of pairs whose mask is the source's, as in a
-    video, where the last frame's pose is all that is known of the next one's mask.
+    video, where the last frame's pose is all that is known of the next one's mask. tone: how far exposure, contrast
+    and white balance stray, 0 = not at all.
     """
 
     photo: float = 0.6
@@ -40,6 +41,7 @@ class AugmentConfig:
     box_mask: float = 0.12
     cut_mask: float = 0.08
     source_mask: float = 0.0
+    tone: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,9 +160,11 @@ def _photograph(scene: Image, config: AugmentConfig, rng: Rng) -> Image:
     H, W = scene.shape[:2]
     x: NDArray[np.float32] = scene.astype(np.float32) / np.float32(255)
     if rng.random() < 0.8:
-        x = np.clip(x, 0, 1) ** np.float32(np.exp(rng.normal() * 0.2))
-        x *= np.exp(rng.normal(size=3) * 0.07).astype(np.float32) * np.float32(np.exp(rng.normal() * 0.18))
-        x = (x - np.float32(0.5)) * np.float32(rng.uniform(0.75, 1.2)) + np.float32(0.5 + rng.normal() * 0.04)
+        tone = config.tone
+        x = np.clip(x, 0, 1) ** np.float32(np.exp(rng.normal() * 0.2 * tone))
+        x *= np.exp((rng.normal(size=3) * 0.07 + rng.normal() * 0.18) * tone).astype(np.float32)
+        contrast = np.float32(rng.uniform(0.75, 1.2) ** tone)
+        x = (x - np.float32(0.5)) * contrast + np.float32(0.5 + rng.normal() * 0.04 * tone)
     if rng.random() < 0.4:
         x = cv2.GaussianBlur(x, (0, 0), float(rng.uniform(0.4, 1.8)))
     if rng.random() < 0.12:

@@ -41,7 +41,8 @@ class TabletopConfig:
     scenes with objects at random in a heap instead of at rest. table: share with a table; the others float before the
     backdrop. photo: share of backdrops that are photographs, where there are any. distance: from the camera to the
     scene's middle. elevation_deg: of the camera over the table. spread: radius in which objects lie. shadow: share of
-    tables with shadows.
+    tables with shadows. paint: how far the objects' paint strays from the meshes', 0 = not at all. scraps: least and
+    most parts cut out of photographs that lie about behind the objects.
     """
 
     size: tuple[int, int] = (640, 480)
@@ -55,10 +56,14 @@ class TabletopConfig:
     elevation_deg: tuple[float, float] = (10.0, 85.0)
     spread: tuple[float, float] = (1.0, 3.0)
     shadow: float = 0.7
+    paint: float = 1.0
+    scraps: tuple[int, int] = (0, 0)
 
     def __post_init__(self) -> None:
         if not 0 <= self.objects[0] <= self.objects[1] or not 0 <= self.distractors[0] <= self.distractors[1]:
             raise ConfigError("a scene's objects and distractors are (least, most), not negative, least first.")
+        if not 0 <= self.scraps[0] <= self.scraps[1] or self.paint < 0:
+            raise ConfigError("a scene's scraps are (least, most), not negative, least first; its paint not negative.")
         if not 0 < self.distance[0] <= self.distance[1] or not 0 < self.spread[0] <= self.spread[1]:
             raise ConfigError("a scene's distance and spread are (least, most), above 0, least first.")
 
@@ -125,10 +130,13 @@ def compose(
         _draw_table(canvas, renderer, T_cam_world, unit, light, photos, rng)
         if rng.random() < config.shadow:
             _draw_shadows(canvas, [m for _, m in chosen], T_world_objs, T_cam_world, light, rng)
+    if len(photos):
+        for _ in range(int(rng.integers(config.scraps[0], config.scraps[1] + 1))):
+            _lay_scrap(canvas.image, photos, rng)
     found = []
     for (number, model), T_world_obj in zip(chosen, T_world_objs, strict=True):
         T_cam_obj = T_cam_world @ T_world_obj
-        whole = canvas.add(renderer, model, T_cam_obj, light, rng)
+        whole = canvas.add(renderer, model, T_cam_obj, light, config.paint, rng)
         if whole:
             found.append((number, model, T_cam_obj, whole))
     canvas.smooth_edges()
@@ -257,7 +265,7 @@ class _Canvas:
         self.labels = np.zeros(image.shape[:2], np.int16)
         self.count = 0
 
-    def add(self, renderer: Renderer, model: ObjectModel, T_cam_obj: Pose, light: Light, rng: Rng) -> int:
+    def add(self, renderer: Renderer, model: ObjectModel, T_cam_obj: Pose, light: Light, paint: float, rng: Rng) -> int:
         """Draw an object; returns the pixels of its whole silhouette, 0 where it is not in the picture at all, too
         near or too large to draw."""
         points = T_cam_obj.apply(model.outline)
@@ -273,7 +281,7 @@ class _Canvas:
         if not drawn.mask.any():
             return 0
         self.count += 1
-        self._paste(repainted(drawn.image, rng), drawn.mask, drawn.depth, left, top, self.count)
+        self._paste(repainted(drawn.image, paint, rng), drawn.mask, drawn.depth, left, top, self.count)
         return int(drawn.mask.sum())
 
     def _paste(
@@ -305,12 +313,13 @@ class _Canvas:
         self.image[edge] = cv2.GaussianBlur(self.image, (3, 3), 0.7)[edge]
 
 
-def repainted(image: Image, rng: Rng) -> Image:
-    """Another paint than the mesh's: gains, gamma and saturation."""
+def repainted(image: Image, strength: float, rng: Rng) -> Image:
+    """Another paint than the mesh's: gains, gamma and saturation. strength: 1 = usual, 0 = the same paint."""
     x = image.astype(np.float32) / 255
     grey = x.mean(-1, keepdims=True)
-    x = np.clip(grey + (x - grey) * np.float32(rng.uniform(0.6, 1.3)), 0, 1) ** np.float32(np.exp(rng.normal() * 0.2))
-    x *= np.exp(rng.normal(size=3) * 0.06).astype(np.float32) * np.float32(np.exp(rng.normal() * 0.15))
+    saturation, gamma = rng.uniform(0.6, 1.3) ** strength, np.exp(rng.normal() * 0.2 * strength)
+    x = np.clip(grey + (x - grey) * np.float32(saturation), 0, 1) ** np.float32(gamma)
+    x *= np.exp((rng.normal(size=3) * 0.06 + rng.normal() * 0.15) * strength).astype(np.float32)
     return (np.clip(x, 0, 1) * 255).astype(np.uint8)
 
 
@@ -324,6 +333,25 @@ def _backdrop(config: TabletopConfig, photos: Sequence[Image], rng: Rng) -> Imag
     low, high = random_colour(rng), random_colour(rng)
     noise = noise_image(rng, config.size, int(rng.choice([1, 3])))
     return np.asarray((low + (high - low) * noise).clip(0, 255).astype(np.uint8))
+
+
+def _lay_scrap(image: Image, photos: Sequence[Image], rng: Rng) -> None:
+    """Paint over a part of a picture with one of a photograph, a blob with straight edges or round; in place."""
+    height, width = image.shape[:2]
+    side = int(width * np.exp(rng.uniform(np.log(0.05), np.log(0.35))))
+    shape = np.zeros((side, side), np.uint8)
+    if rng.random() < 0.6:
+        corners = (rng.uniform(0, 1, size=(int(rng.integers(4, 9)), 1, 2)) * side).astype(np.int32)
+        cv2.fillConvexPoly(shape, cv2.convexHull(corners), 1)
+    else:
+        axes = tuple(int(a) for a in (rng.uniform(0.15, 0.5, size=2) * side))
+        cv2.ellipse(shape, (side // 2, side // 2), axes, float(rng.uniform(0, 180)), 0, 360, 1, -1)
+    part = photo_crop(rng, photos, (side, side))
+    left, top = int(rng.integers(-side // 2, width - side // 2)), int(rng.integers(-side // 2, height - side // 2))
+    here = image[max(0, top) : top + side, max(0, left) : left + side]
+    there = (slice(max(0, -top), max(0, -top) + here.shape[0]), slice(max(0, -left), max(0, -left) + here.shape[1]))
+    on = shape[there] > 0
+    here[on] = part[there][on]
 
 
 def _draw_table(
