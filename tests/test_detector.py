@@ -16,6 +16,7 @@ from posekit.camera import Camera
 from posekit.cli.app import app
 from posekit.data.tabletop import TabletopConfig, procedural_objects
 from posekit.data.tabletop_stream import TabletopStream, TabletopStreamConfig, labelled_scenes
+from posekit.detect import maskrcnn
 from posekit.detect.coco import Truth, average_precision
 from posekit.detect.external import DetectionsFile, categories_of, to_bop, to_coco
 from posekit.detect.maskrcnn import (
@@ -346,12 +347,33 @@ def test_instances_are_what_scores_and_does_not_overlap() -> None:
 
 
 def test_detections_are_judged_by_their_poses() -> None:
-    a, b, c = (Detection((k, 0.0, k + 10.0, 10.0), score=0.9 - 0.1 * k, label="m") for k in range(3))
+    a, b, c = (Detection((k, 0.0, k + 10.0, 10.0), None, 0.9 - 0.1 * k, "m", "novel") for k in range(3))
     estimates = [
         Estimate(Pose.identity(), 0.0, 1, True, score, found.box, "m", found) for score, found in ((0.2, a), (0.7, b))
     ]
     found = judged([a, b, c], estimates)
     assert [(d.box, d.score) for d in found] == [(b.box, 0.7), (a.box, 0.2), (c.box, 0.0)]
+    trained = dataclasses.replace(b, source="mask-rcnn", score=0.5)
+    estimates = [Estimate(Pose.identity(), 0.0, 1, True, 0.7, trained.box, "m", trained)]
+    assert judged([trained], estimates)[0].score == pytest.approx(0.35)
+
+
+def test_looks_in_two_sizes_are_joined(untrained: TrainedDetector, monkeypatch: pytest.MonkeyPatch) -> None:
+    masks = np.zeros((3, 60, 80), bool)
+    masks[:, 5:20, 5:20] = True
+    looks = iter(
+        [
+            Found(np.array([[4.0, 4, 20, 20], [40, 30, 60, 50]]), np.array([0, 0]), np.array([0.9, 0.4]), masks[:2]),
+            Found(np.array([[6.0, 4, 22, 20], [4.0, 4, 20, 20]]), np.array([0, 1]), np.array([0.3, 0.2]), masks[:2]),
+        ]
+    )
+    monkeypatch.setattr(maskrcnn, "find", lambda *_, **__: next(looks))
+    image = np.zeros((60, 80, 3), np.uint8)
+    found = maskrcnn.find_in_sizes(untrained, image, (1.0, 2.0), least=0.15)
+    assert found.scores.tolist() == pytest.approx([0.6, 0.2]) and found.labels.tolist() == [0, 0]
+    np.testing.assert_allclose(found.boxes, [[4.5, 4, 20.5, 20], [40, 30, 60, 50]], atol=1e-4)
+    looks = iter([Found(np.zeros((0, 4)), np.zeros(0, np.int64), np.zeros(0), masks[:0])] * 2)
+    assert not len(maskrcnn.find_in_sizes(untrained, image, (1.0, 2.0), least=0.15).scores)
 
 
 # --- commands -----------------------------------------------------------------------------------------------------

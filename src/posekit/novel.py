@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from posekit.camera import Camera
 from posekit.detect import Detector
 from posekit.detect.backbones import LITE0_MEAN, LITE0_STD, Lite0, lite0_imagenet, load_lite0
-from posekit.detect.maskrcnn import COCO, SHIPPED, MaskRCNN, TrainedDetector, find, load_coco, load_detector
+from posekit.detect.maskrcnn import COCO, DOUBTFUL, SHIPPED, MaskRCNN, TrainedDetector, find, load_coco, load_detector
 from posekit.detect.sharpen import sharpened
 from posekit.detect.vision import torchvision
 from posekit.errors import ConfigError
@@ -216,17 +216,21 @@ def make_detector(
     *,
     least: float | None = None,
     most: int = 3,
+    doubtful: bool = False,
     threads: int | None = None,
 ) -> tuple[Detector, tuple[str, ...]]:
     """A network's Detector and the names that its detections may have. name: "novel" (the default), "coco", or a
-    trained detector's file or folder. Raises WeightsError, ConfigError."""
+    trained detector's file or folder. most: detections of a mesh. doubtful: whether poses will judge the detections, so
+    that trained detectors' doubtful ones are wanted too, and no more than ``most``. Raises WeightsError, ConfigError.
+    """
     if threads is not None:
         torch.set_num_threads(threads)
     file = SHIPPED if name is None or name == ANY else Path(name)
     trained = load_coco() if name == COCO else load_detector(file)
     if not trained.config.novel:
         names = tuple(m.name for m in models) or trained.config.classes
-        return MaskRCNN(trained, 0.5 if least is None else least), names
+        usual = DOUBTFUL if doubtful else 0.5
+        return MaskRCNN(trained, usual if least is None else least, most if doubtful else 0), names
 
     options = NovelOptions(most=most) if least is None else NovelOptions(least=least, least_proposal=least, most=most)
     if models and least is not None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from posekit.camera import Box
 from posekit.errors import ConfigError
 from posekit.estimate import PoseEstimator
+from posekit.novel import ANY
 from posekit.results import Detection, Estimate
 from posekit.view import View
 
@@ -48,9 +49,13 @@ def instances_of(estimates: Sequence[Estimate], options: SearchOptions = SearchO
 
 
 def judged(detections: Sequence[Detection], estimates: Sequence[Estimate]) -> list[Detection]:
-    """The detections with the scores of the estimates that they led to, best first; 0 for one that led to none."""
+    """The detections with the scores of the estimates that they led to, best first; 0 for one that led to none. A
+    detector that was trained for the object has its say: its own score is a factor."""
     scores = {id(each.detection): each.score for each in estimates}
-    found = [replace(detection, score=scores.get(id(detection), 0.0)) for detection in detections]
+    found = [
+        replace(each, score=scores.get(id(each), 0.0) * (1.0 if each.source == ANY else each.score))
+        for each in detections
+    ]
     return sorted(found, key=lambda d: -d.score)
 
 

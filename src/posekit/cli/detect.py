@@ -82,7 +82,12 @@ def detect(
     view = load_view(image, camera)
     meshes = [ObjectModel.load(path, units=units) for path in model or ()]
     finder, classes = make_detector(
-        str(weights) if weights is not None else detector, meshes, least=least, most=most, threads=threads
+        str(weights) if weights is not None else detector,
+        meshes,
+        least=None if verify else least,
+        most=most,
+        doubtful=bool(verify),
+        threads=threads,
     )
     verify = isinstance(finder, NovelDetector) and bool(meshes) if verify is None else verify
     if verify and isinstance(finder, NovelDetector):  # the poses are asked for the least score, not the looks

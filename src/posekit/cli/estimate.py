@@ -102,7 +102,8 @@ def estimate(
         from posekit.novel import make_detector
 
         with destination.working("loading the detector"):
-            finder, _ = make_detector(detector, meshes, most=max(CANDIDATES, instances + 1), threads=threads)
+            candidates = max(CANDIDATES, instances + 1)
+            finder, _ = make_detector(detector, meshes, most=candidates, doubtful=True, threads=threads)
     with destination.working("detecting"):
         found = finder.detect(view, meshes)
     with destination.working("loading the networks"):

@@ -30,6 +30,9 @@ from posekit.view import View
 KIND = SOURCE = "mask-rcnn"
 NOVEL = ("object",)  # the one class of a class-agnostic detector
 SHIPPED = Path(__file__).resolve().parent.parent / "weights" / "detector-novel"
+SCALES = {"lite0": (1.0, 4 / 3), "resnet50": (1.0,)}  # of the picture's size, one look each
+DOUBTFUL = 0.05  # score of a look's detections that may be joined with another look's
+SAME = 0.5  # intersection over union from which two looks' boxes are of one instance
 COCO = "coco"
 
 
@@ -236,14 +239,56 @@ def find(
     )
 
 
-class MaskRCNN:
-    """A Detector that was trained for its classes; a model is found by its name."""
+def find_in_sizes(
+    detector: TrainedDetector, image: NDArray[np.uint8], scales: Sequence[float], *, least: float, most: int = 50
+) -> Found:
+    """Look at a picture in several sizes, and join what overlaps by half and has the same label: the mean of the scores
+    (0 from a look that does not see it), the boxes' mean weighted by score, the surest look's mask.
 
-    def __init__(self, detector: TrainedDetector, least: float = 0.5) -> None:
-        self.detector, self.least = detector, least
+    scales: of the configuration's ``use_size``. least: of the joined score. most: detections of a look. Raises
+    ValueError without scales.
+    """
+    width, height = detector.config.use_size
+    looks = [
+        find(detector, image, least=min(least, DOUBTFUL), most=most, size=(round(scale * width), round(scale * height)))
+        for scale in scales
+    ]
+    which = np.repeat(np.arange(len(looks)), [len(look.scores) for look in looks])
+    boxes, labels, scores, masks = (
+        np.concatenate([getattr(look, name) for look in looks]) for name in ("boxes", "labels", "scores", "masks")
+    )
+    overlaps = torchvision().ops.box_iou(torch.from_numpy(boxes), torch.from_numpy(boxes)).numpy()
+    order, groups = np.argsort(-scores, kind="stable"), []
+    while len(order):
+        same = (overlaps[order[0], order] > SAME) & (labels[order] == labels[order[0]])
+        same[0] = True  # even where it has no area
+        groups.append(order[same])
+        order = order[~same]
+    means = np.array([_mean_of_looks(scores[group], which[group], len(looks)) for group in groups])
+    kept = [groups[k] for k in np.argsort(-means, kind="stable") if means[k] >= least]
+    first = [group[0] for group in kept]
+    return Found(
+        np.array([np.average(boxes[g], axis=0, weights=scores[g] + 1e-6) for g in kept]).reshape(-1, 4),
+        labels[first],
+        -np.sort(-means[means >= least]),
+        masks[first],
+    )
+
+
+def _mean_of_looks(scores: NDArray[np.float64], which: NDArray[np.int64], looks: int) -> float:
+    return sum(float(scores[which == look].max(initial=0.0)) for look in range(looks)) / looks
+
+
+class MaskRCNN:
+    """A Detector that was trained for its classes; a model is found by its name. least: score of a detection. most: of
+    one class, 0 = all. It looks at the picture in the sizes that `SCALES` has for its backbone."""
+
+    def __init__(self, detector: TrainedDetector, least: float = 0.5, most: int = 0) -> None:
+        self.detector, self.least, self.most = detector, least, most
 
     def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
-        """Instances of the models; with no models, of all classes. Raises ConfigError where a model is no class."""
+        """Instances of the models, by falling score; with no models, of all classes. Raises ConfigError where a model
+        is no class."""
         classes = self.detector.config.classes
         unknown = [m.name for m in models if m.name not in classes]
         if unknown:
@@ -251,14 +296,15 @@ class MaskRCNN:
                 f"this detector does not know {', '.join(unknown)}; it was trained for {', '.join(classes)}. Use "
                 "--detector novel, or train one with posekit train detector."
             )
-        found = find(self.detector, view.image, least=self.least)
-        names = [classes[k] for k in found.labels]
-        wanted = {m.name for m in models} or set(classes)
-        return [
-            sharpened(view.image, Detection(_box(found.boxes[k]), found.masks[k], float(found.scores[k]), name, SOURCE))
-            for k, name in enumerate(names)
-            if name in wanted
-        ]
+        found = find_in_sizes(self.detector, view.image, SCALES[self.detector.config.backbone], least=self.least)
+        left = dict.fromkeys([m.name for m in models] or classes, self.most or len(found.labels))
+        detections = []
+        for box, label, score, mask in zip(found.boxes, found.labels, found.scores, found.masks, strict=True):
+            name = classes[label]
+            if left.get(name, 0):
+                left[name] -= 1
+                detections.append(sharpened(view.image, Detection(_box(box), mask, float(score), name, SOURCE)))
+        return detections
 
 
 def _box(values: NDArray[np.float64]) -> tuple[float, float, float, float]:

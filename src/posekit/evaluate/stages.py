@@ -27,7 +27,7 @@ from posekit.evaluate.tracking import Sequences
 from posekit.evaluate.truths import Truth, TruthReader, selected
 from posekit.geometry import Pose
 from posekit.metrics import box_iou
-from posekit.novel import ANY, make_detector
+from posekit.novel import make_detector
 from posekit.results import Detection, Estimate
 from posekit.search import SearchOptions, instances_of, judged
 from posekit.view import View
@@ -126,13 +126,13 @@ class ImageStage:
 
     def _detected(self, view: View, scene: int, image: int) -> tuple[list[Record], list[FoundRegion]]:
         """Estimates from what the detector finds of the data set's objects, and the detections. As `posekit estimate`
-        does, only what the render bears out is kept, but any number of instances; novel objects' detections are
-        scored by the poses that they lead to."""
+        does, only what the render bears out is kept, but any number of instances; detections are scored by the poses
+        that they lead to."""
         numbers = self.options.objects or tuple(self.data.model_ids())
         models = {obj_id: self.data.model(obj_id) for obj_id in numbers}
         if self._detector is None:
             self._detector, _ = make_detector(
-                self.options.detector, list(models.values()), threads=self.options.threads
+                self.options.detector, list(models.values()), doubtful=True, threads=self.options.threads
             )
         started = time.perf_counter()
         found = self._detector.detect(view, list(models.values()))
@@ -142,10 +142,7 @@ class ImageStage:
             mine = [d for d in found if d.label == model.name]
             options = SearchOptions(instances=0)
             estimates = self._estimator(obj_id).estimate(view, mine, options.least)
-            if any(d.source == ANY for d in mine):
-                regions += [_region(d, scene, image, obj_id, seconds) for d in judged(mine, estimates)]
-            else:
-                regions += [_region(d, scene, image, obj_id, seconds) for d in mine]
+            regions += [_region(d, scene, image, obj_id, seconds) for d in judged(mine, estimates)]
             for estimate in instances_of(estimates, options):
                 assert estimate.detection is not None
                 entries.append(_entry(estimate, obj_id, None) | {"detection_score": estimate.detection.score})
