@@ -39,7 +39,7 @@ from posekit.novel import NovelDetector
 from posekit.object_model import ObjectModel
 from posekit.render import Renderer
 from posekit.results import Detection, Estimate
-from posekit.search import SearchOptions, box_overlap, estimate_instances, judged
+from posekit.search import SearchOptions, box_overlap, estimate_instances, estimates_of, judged
 from posekit.train.config import MachineConfig, OptimiserConfig, SourceConfig, write_config
 from posekit.train.detector import DetectorConfig, DetectorModule, read_config, target, train_detector
 from posekit.view import View
@@ -328,7 +328,7 @@ class _Estimator:
         self.found = [Estimate(Pose.identity(), 0.0, 1, True, s, b, "m") for s, b in zip(scores, boxes, strict=True)]
 
     def estimate(self, view: View, detections: list[Detection], least: float = 0.0) -> list[Estimate]:
-        return self.found[: len(detections)]
+        return [each for each in self.found if any(each.box == detection.box for detection in detections)]
 
 
 def test_instances_are_what_scores_and_does_not_overlap() -> None:
@@ -343,6 +343,9 @@ def test_instances_are_what_scores_and_does_not_overlap() -> None:
     assert scores(SearchOptions(instances=0, least=0.3)) == [0.8, 0.5]
     assert scores(SearchOptions(instances=1, least=0.3)) == [0.8]
     assert scores(SearchOptions(least=0.9)) == []
+    unlike, alike = (dataclasses.replace(detections[0], source="novel", score=s) for s in (0.46, 0.66))
+    found = [estimates_of(estimator, view, [each])[0].score for each in (unlike, alike)]  # type: ignore[arg-type]
+    np.testing.assert_allclose(found, [0.6 / (0.6 + 0.4 * np.exp(2)), 0.6 / (0.6 + 0.4 * np.exp(-2))])
     assert box_overlap(boxes[0], boxes[1]) == pytest.approx(9 / 11)
 
 

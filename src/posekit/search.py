@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -11,6 +12,8 @@ from posekit.estimate import PoseEstimator
 from posekit.novel import ANY
 from posekit.results import Detection, Estimate
 from posekit.view import View
+
+WEIGHT, USUAL = 20.0, 0.56  # of a novel object's likeness, and the one that says nothing: docs/decisions/0015
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,26 @@ def estimate_instances(
     estimator: PoseEstimator, view: View, detections: Sequence[Detection], options: SearchOptions = SearchOptions()
 ) -> list[Estimate]:
     """The instances among an object's detections, best first; none is an empty list."""
-    return instances_of(estimator.estimate(view, detections, options.least), options)
+    return instances_of(estimates_of(estimator, view, detections, options), options)
+
+
+def estimates_of(
+    estimator: PoseEstimator, view: View, detections: Sequence[Detection], options: SearchOptions = SearchOptions()
+) -> list[Estimate]:
+    """An estimate for each detection that leads to one, in their order. What the novel detector found is scored by
+    how much it looks like the mesh as well: a logistic function's argument grows by `WEIGHT` times what the likeness
+    is above `USUAL` (docs/decisions/0015)."""
+    found = []
+    for detection in detections:
+        shift = WEIGHT * (detection.score - USUAL) if detection.source == ANY else 0.0
+        for estimate in estimator.estimate(view, [detection], _shifted(options.least, -shift)):
+            found.append(replace(estimate, score=_shifted(estimate.score, shift)))
+    return found
+
+
+def _shifted(chance: float, shift: float) -> float:
+    """A chance whose log odds are shifted; 0 and 1 stay."""
+    return chance if not 0 < chance < 1 else 1 / (1 + (1 / chance - 1) * math.exp(-shift))
 
 
 def instances_of(estimates: Sequence[Estimate], options: SearchOptions = SearchOptions()) -> list[Estimate]:

@@ -116,11 +116,13 @@ def _verified(
 ) -> list[Detection]:
     """What a pose speaks for, best first, scored by it."""
     from posekit.estimate import PoseEstimator
-    from posekit.search import judged
+    from posekit.search import SearchOptions, estimates_of, judged
 
     kept = []
     for mesh in meshes:
         mine = [d for d in found if d.label == mesh.name]
-        estimates = PoseEstimator(mesh, threads=threads).estimate(view, mine, least) if mine else []
+        estimates = (
+            estimates_of(PoseEstimator(mesh, threads=threads), view, mine, SearchOptions(least=least)) if mine else []
+        )
         kept += [d for d in judged(mine, estimates) if d.score >= least]
     return sorted(kept, key=lambda d: -d.score)

@@ -29,7 +29,7 @@ from posekit.geometry import Pose
 from posekit.metrics import box_iou
 from posekit.novel import make_detector
 from posekit.results import Detection, Estimate
-from posekit.search import SearchOptions, instances_of, judged
+from posekit.search import SearchOptions, estimates_of, instances_of, judged
 from posekit.view import View
 
 Record = dict[str, Any]
@@ -141,7 +141,7 @@ class ImageStage:
         for obj_id, model in models.items():
             mine = [d for d in found if d.label == model.name]
             options = SearchOptions(instances=0)
-            estimates = self._estimator(obj_id).estimate(view, mine, options.least)
+            estimates = estimates_of(self._estimator(obj_id), view, mine, options)
             regions += [_region(d, scene, image, obj_id, seconds) for d in judged(mine, estimates)]
             for estimate in instances_of(estimates, options):
                 assert estimate.detection is not None
