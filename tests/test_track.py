@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import sys
 import tracemalloc
@@ -27,7 +28,7 @@ from posekit.object_model import ObjectModel
 from posekit.odometry import Look, follow_points, match_texture
 from posekit.recording import Recorder
 from posekit.refine import crops
-from posekit.region import learn, outline_lines
+from posekit.region import Tint, learn, off_colour, outline_lines
 from posekit.render import Renderer
 from posekit.results import Detection, Estimate
 from posekit.track import LOST, RESTARTED, TRACKED, TrackConfig, Tracker
@@ -195,6 +196,27 @@ def test_an_outline_is_not_sought_where_the_object_is_hidden(model: ObjectModel,
     assert outline_lines(at.seen, at.drawn, colours, np.zeros_like(seen), model.center) is None
 
 
+def test_what_is_suddenly_of_another_colour_hides_the_object(model: ObjectModel, renderer: Renderer) -> None:
+    view = photograph(renderer, model, path(model, 0))
+    warmer = View((view.image * np.array([1.0, 0.9, 0.75])).astype(np.uint8), CAMERA)
+    at = looked(warmer, model, renderer, path(model, 0))
+    assert at.drawn.mask is not None
+    tint = Tint.of(off_colour(at.seen, at.drawn), at.drawn.mask)
+    assert not tint.hides(off_colour(at.seen, at.drawn), at.drawn.mask).any(), (
+        "another light than the mesh's, as it was"
+    )
+    image = at.seen.image.copy()
+    image[40:80, 70:100] = (200, 30, 220)
+    patch = np.zeros_like(at.visible)
+    patch[40:80, 70:100] = True
+    hidden = tint.hides(off_colour(replace(at.seen, image=image), at.drawn), at.drawn.mask)
+    covered = patch & at.drawn.mask
+    assert covered.sum() > 300 and (hidden & covered).sum() > 0.85 * covered.sum()
+    assert (hidden & ~patch).sum() < 0.25 * covered.sum(), "the edge is blurred"
+    lines = outline_lines(at.seen, at.drawn, learn(at.seen, at.drawn.mask, at.visible), ~hidden, model.center)
+    assert lines is not None and not patch[tuple(np.rint(lines.places[:, ::-1]).astype(int).T)].any()
+
+
 def test_beliefs_are_weighed_by_their_information() -> None:
     camera = Camera(200.0, 200.0, 79.5, 59.5, 160, 120)
     a, b = Pose(np.eye(3), [0.0, 0.0, 1.0]), Pose(so3_exp([0.0, 0.02, 0.0]), [0.03, 0.0, 1.0])
@@ -318,6 +340,7 @@ def test_memory_does_not_grow(model: ObjectModel, renderer: Renderer) -> None:
         for k in range(80):
             following.predictor.truth = path(model, k % 2)  # type: ignore[attr-defined]
             assert following.step(frames[k % 2]).state == TRACKED
+            gc.collect()
             sizes.append(tracemalloc.get_traced_memory()[0])
     finally:
         tracemalloc.stop()

@@ -29,6 +29,8 @@ LEAST = 20  # lines
 GAP, RING = 1, 14  # pixels beside the outline that teach no colours, and how far the surroundings reach
 BLUR = 1.0  # pixels over which neighbours decide together whose they are
 HUE = 0.12  # distance of chromaticities beyond which a pixel is not the mesh's
+SUDDEN, SMOOTH = 0.12, 1.0  # the same beyond what it has been before; pixels over which that is averaged
+HIDDEN, BESIDE = 2, 5  # pixels: how deep a hidden part is that no pose's error explains, and how far it spoils outlines
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +57,33 @@ class Colours:
         return np.asarray(cv2.GaussianBlur(self.posterior(view.image), (0, 0), BLUR) > 0.35)
 
 
+@dataclass(frozen=True, eq=False)
+class Tint:
+    """How far from the mesh's the colours of a frame's crop have been. apart: (H, W, 3), of chromaticities.
+
+    Light, wear and the camera change the mesh's colours slowly. What is suddenly further from them is something else
+    in front of the object, even where it has colours that the object has elsewhere.
+    """
+
+    apart: FArray
+
+    @classmethod
+    def of(cls, apart: FArray, seen: Mask) -> Tint:
+        """Of one frame. seen: (H, W), where it shows the object; elsewhere the median is taken."""
+        usual = np.median(apart[seen], axis=0) if seen.any() else np.zeros(3, np.float32)
+        return cls(np.where(seen[..., None], cv2.GaussianBlur(apart, (0, 0), SMOOTH), usual).astype(np.float32))
+
+    def hides(self, apart: FArray, silhouette: Mask) -> Mask:
+        """Where (H, W) something else is before the silhouette."""
+        further = apart - self.apart
+        far = silhouette & ((further * further).sum(axis=2) > SUDDEN**2)
+        return np.asarray(cv2.morphologyEx(far.astype(np.uint8), cv2.MORPH_OPEN, _disc(1)) > 0)
+
+    def mixed(self, newer: Tint, share: float) -> Tint:
+        """With a share of a newer one."""
+        return Tint((1 - share) * self.apart + share * newer.apart)
+
+
 def learn(view: View, silhouette: Mask, seen: Mask) -> Colours:
     """From a frame's crop. silhouette, seen: (H, W), the rendered one and what of it the frame shows."""
     solid, shown = silhouette.astype(np.uint8), view.shown
@@ -65,8 +94,12 @@ def learn(view: View, silhouette: Mask, seen: Mask) -> Colours:
 
 def like_mesh(view: View, drawn: View) -> Mask:
     """Where (H, W) a frame's crop has the hue of the mesh drawn there: a first guess of what is not hidden."""
-    distance = np.linalg.norm(_chromaticity(view.image) - _chromaticity(drawn.image), axis=2)
-    return np.asarray(distance < HUE)
+    return np.asarray(np.linalg.norm(off_colour(view, drawn), axis=2) < HUE)
+
+
+def off_colour(view: View, drawn: View) -> FArray:
+    """How far (H, W, 3) the chromaticities of a frame's crop are from those of the mesh drawn there."""
+    return _chromaticity(view.image) - _chromaticity(drawn.image)
 
 
 def outline_lines(view: View, drawn: View, colours: Colours, seen: Mask, center: Array) -> Lines | None:
@@ -85,7 +118,11 @@ def outline_lines(view: View, drawn: View, colours: Colours, seen: Mask, center:
     places = pixels + normals * mean[:, None]
     there, _ = _pixels(places, view)
     near = cv2.dilate(seen.astype(np.uint8), np.ones((5, 5), np.uint8))[there[:, 1], there[:, 0]] > 0
-    usable = near & (sigma < 0.5 * REACH) & (np.abs(mean) < REACH - 1.5) & (inside[:, TAIL:-TAIL].mean(axis=1) > 0.9)
+    # the edge of what hides the object is taken for its outline, and draws it along
+    hidden = cv2.erode((drawn.mask & ~seen).astype(np.uint8), _disc(HIDDEN))
+    spoilt = cv2.dilate(hidden, _disc(HIDDEN + BESIDE))[pixels[:, 1].astype(int), pixels[:, 0].astype(int)] > 0
+    usable = near & ~spoilt & (sigma < 0.5 * REACH) & (np.abs(mean) < REACH - 1.5)
+    usable &= inside[:, TAIL:-TAIL].mean(axis=1) > 0.9
     if usable.sum() < LEAST:
         return None
     columns, rows = pixels[usable].astype(int).T

@@ -27,7 +27,7 @@ from posekit.nets.predictor import PairPrediction, Predictor
 from posekit.object_model import ObjectModel
 from posekit.odometry import Look, follow_points, match_texture
 from posekit.refine import crops
-from posekit.region import Colours, learn, like_mesh, outline_lines
+from posekit.region import Colours, Tint, learn, like_mesh, off_colour, outline_lines
 from posekit.results import Detection, Estimate
 from posekit.view import View
 
@@ -40,6 +40,7 @@ AHEAD = (10.0, 8.0, 0.05)  # of the motion between two frames, where they are co
 UNSEEN = (6.0, 4.0, 0.02)  # of that motion, when nothing else is known about it
 SUREST = (0.3, 0.1, 0.003)  # of any pose: errors last over many frames
 TOGETHER, DOUBTED = 25.0, math.radians(4.0)  # so many correspondences err alike, and at this predicted angle twice that
+TINTED = 0.15  # share of a frame in what is known of the tint
 LEAST_SCALE, KNEE = 0.5, 2.5  # pixels, no correspondence is more exact; standard deviations
 
 
@@ -149,6 +150,7 @@ class Tracker:
         self._motion = Pose.identity()  # of the object's centre and axes, from the frame before the last to the last
         self._before: Look | None = None
         self._colours: Colours | None = None
+        self._tint: Tint | None = None
         self._doubts = 0
         self._waiting = 0  # frames until the next search
 
@@ -188,15 +190,16 @@ class Tracker:
         if (visible & drawn.mask).sum() < 0.15 * drawn.mask.sum():
             visible = np.ones_like(visible)
         self._colours = learn(seen, drawn.mask, visible)
+        self._tint = Tint.of(off_colour(seen, drawn), visible & drawn.mask)
         self._before = Look(seen, drawn, Pose.rotation(seen.R_view_cam) @ centred, visible)
         return True
 
     def _follow(self, view: View, last: Belief) -> Estimate | None:
         """From where the object is expected; None where it cannot be compared."""
         started, network, angle, comparisons = time.perf_counter(), 0.0, 0.0, 0
-        before, colours = self._before, self._colours
-        assert before is not None and colours is not None
-        ahead = self._ahead(view, before, last, colours)
+        before, colours, tint = self._before, self._colours, self._tint
+        assert before is not None and colours is not None and tint is not None
+        ahead = self._ahead(view, before, last, colours, tint)
         belief = ahead
         while comparisons < self.config.iterations:
             comparisons += 1
@@ -205,7 +208,8 @@ class Tracker:
                 return None
             seen, drawn = self._crops(view, pose)
             assert drawn.mask is not None
-            visible = colours.seen(seen)
+            apart = off_colour(seen, drawn)
+            visible = colours.seen(seen) & ~tint.hides(apart, drawn.mask)
             answer = self._beside.submit(self._asked, seen, drawn, visible)
             look = Look(seen, drawn, Pose.rotation(seen.R_view_cam) @ belief.pose, visible)
             others = self._lines(look, colours) + self._texture(look)  # while the network thinks
@@ -229,10 +233,11 @@ class Tracker:
         self._belief, self._before = belief, look
         if angle < math.radians(self.config.restart_deg) and share > self.config.alike:
             self._colours = colours.mixed(newer, self.config.learn)
+        self._tint = tint.mixed(Tint.of(apart, visible & drawn.mask), TINTED)
         timings = {"network": network, "total": time.perf_counter() - started}
         return self._estimate(view, pose, angle, comparisons, share, timings)
 
-    def _ahead(self, view: View, before: Look, last: Belief, colours: Colours) -> Belief:
+    def _ahead(self, view: View, before: Look, last: Belief, colours: Colours, tint: Tint) -> Belief:
         """Where the object is expected, as ``T_cam_ctr``: from the last frame, without a comparison with the mesh."""
         camera, R = before.drawn.camera, before.seen.R_view_cam
         believed = last.turned(R)
@@ -245,7 +250,9 @@ class Tracker:
             if points is not None:
                 known.append(points)
                 motion.append(points)
-        lines = self._lines(replace(before, seen=seen, visible=colours.seen(seen)), colours)
+        assert before.drawn.mask is not None
+        visible = colours.seen(seen) & ~tint.hides(off_colour(seen, before.drawn), before.drawn.mask)
+        lines = self._lines(replace(before, seen=seen, visible=visible), colours)
         found = fuse(start, [*known, *lines], camera)
         pose = start if found is None else found.pose
         moved = np.sum([term.equations(pose, camera)[0] for term in motion], axis=0)
