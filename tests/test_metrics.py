@@ -273,6 +273,7 @@ def test_coco_ap_equals_pycocotools() -> None:
     overlaps = [metrics.box_iou(f, t) for t, f, _ in pictures]
     assert 0.1 < judge.stats[0] < 0.9
     assert metrics.coco_ap(truths, detections, overlaps) == pytest.approx(judge.stats[0], abs=1e-9)
+    assert metrics.coco_ap(truths, detections, overlaps, (0.5,)) == pytest.approx(judge.stats[1], abs=1e-9)
 
 
 def test_coco_ap_neither_asks_for_nor_holds_against_what_is_ignored() -> None:

@@ -187,8 +187,14 @@ def average_precision(hits: ArrayLike, scores: ArrayLike, total: int) -> float:
     return float(np.append(precision, 0.0)[first].mean())
 
 
-def coco_ap(truths: Sequence[Regions], found: Sequence[Regions], overlaps: Sequence[Array]) -> float:
-    """COCO's AP of one class: the mean over IoU 0.50, 0.55, ..., 0.95. Each argument has one entry per picture.
+def coco_ap(
+    truths: Sequence[Regions],
+    found: Sequence[Regions],
+    overlaps: Sequence[Array],
+    thresholds: Sequence[float] = COCO_IOU,
+) -> float:
+    """COCO's AP of one class: the mean over IoU 0.50, 0.55, ..., 0.95, or AP50 with the threshold 0.5 alone. Each
+    argument but the last has one entry per picture.
 
     overlaps: IoU (D, G) of detections and truths, of boxes (`box_iou`) or of masks.
     NaN where there is nothing to be found.
@@ -197,7 +203,7 @@ def coco_ap(truths: Sequence[Regions], found: Sequence[Regions], overlaps: Seque
     if not total:
         return float("nan")
     levels = []
-    for threshold in COCO_IOU:
+    for threshold in thresholds:
         hits, scores = [], []
         for truth, here, iou in zip(truths, found, overlaps, strict=True):
             order = np.argsort(-here.scores, kind="stable")[:COCO_MOST]

@@ -210,10 +210,10 @@ def _from_csv(
 
 
 def detection_ap(records: Sequence[Mapping[str, Record]]) -> dict[str, float | None]:
-    """COCO's box and mask AP (percent), the mean over the objects, from the overlaps kept for each picture."""
+    """COCO's box and mask AP and AP50 (percent), means over the objects, from the overlaps kept for each picture."""
     result: dict[str, float | None] = {}
     for kind in ("box", "mask"):
-        values: list[float] = []
+        values: list[tuple[float, float]] = []
         for obj_id in sorted({o for r in records for o in r}):
             here = [r[obj_id] for r in records if obj_id in r]
             if any(e[f"{kind}_iou"] is None for e in here):
@@ -223,9 +223,11 @@ def detection_ap(records: Sequence[Mapping[str, Record]]) -> dict[str, float | N
             found = [metrics.Regions(np.array(e["scores"]), np.zeros(0, dtype=np.bool_)) for e in here]
             shape = [(len(e["scores"]), len(e["ignored"])) for e in here]
             iou = [np.array(e[f"{kind}_iou"], dtype=np.float64).reshape(s) for e, s in zip(here, shape, strict=True)]
-            values.append(metrics.coco_ap(truths, found, iou))
-        known = [v for v in values if np.isfinite(v)]
-        result[f"coco_{kind}_ap"] = 100 * float(np.mean(known)) if known else None
+            values.append((metrics.coco_ap(truths, found, iou), metrics.coco_ap(truths, found, iou, (0.5,))))
+        known = [v for v in values if np.isfinite(v).all()]
+        result[f"coco_{kind}_ap"], result[f"coco_{kind}_ap50"] = (
+            (100 * np.mean(known, axis=0)).tolist() if known else (None, None)
+        )
     return result
 
 
