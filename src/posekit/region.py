@@ -76,7 +76,7 @@ class Tint:
     def hides(self, apart: FArray, silhouette: Mask) -> Mask:
         """Where (H, W) something else is before the silhouette."""
         further = apart - self.apart
-        far = silhouette & ((further * further).sum(axis=2) > SUDDEN**2)
+        far = silhouette & (_sum(further * further) > SUDDEN**2)
         return np.asarray(cv2.morphologyEx(far.astype(np.uint8), cv2.MORPH_OPEN, _disc(1)) > 0)
 
     def mixed(self, newer: Tint, share: float) -> Tint:
@@ -179,7 +179,12 @@ def _histogram(index: NDArray[np.intp]) -> FArray:
 
 def _chromaticity(image: NDArray[np.uint8]) -> FArray:
     smooth = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.float32) + 8
-    return np.asarray(smooth / smooth.sum(axis=2, keepdims=True), np.float32)
+    return np.asarray(smooth / _sum(smooth)[..., None], np.float32)
+
+
+def _sum(image: FArray) -> FArray:
+    """Over three channels; numpy's own sum takes ten times as long."""
+    return np.asarray(image[..., 0] + image[..., 1] + image[..., 2], np.float32)
 
 
 def _disc(radius: int) -> NDArray[np.uint8]:
