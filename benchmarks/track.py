@@ -78,10 +78,13 @@ def follow(data: BopDataset, scene: int, images: list[int], begin: int, obj_id: 
            detector: TrueMasks) -> list[dict[str, Any]]:  # fmt: skip
     """What was said of each frame from ``begin`` on, with its errors and seconds."""
     model, rows = tracker.model, []
-    frames = itertools.islice(ReadAhead(VideoFrames(video, None)), begin, None)
+    known = []  # before anything is timed
     for image in images[begin:]:
         truth = next((i for i in data.instances(scene, image, every=True) if i.obj_id == obj_id), None)
-        detector.instance, camera = truth, data.view(scene, image).camera
+        known.append((image, truth, data.view(scene, image).camera))
+    frames = itertools.islice(ReadAhead(VideoFrames(video, None)), begin, None)
+    for image, truth, camera in known:
+        detector.instance = truth
         started, cpu = time.perf_counter(), time.process_time()
         frame = next(frames)
         assert frame.image is not None

@@ -26,6 +26,7 @@ LAYERS = {
 ANYWHERE = {"errors", "_version"}
 # Fusion weighs what PnP alone solves. A camera turns rays; tracking and the search for instances are measured too.
 SIBLINGS = {("camera", "geometry"), ("fusion", "pnp"), ("evaluate", "track"), ("evaluate", "search")}
+SIBLINGS |= {("odometry", "region")}  # a look keeps its outline
 
 # A foreign library and the rooms whose door it is.
 DOORS = {

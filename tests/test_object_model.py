@@ -13,9 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from objects import cuboid
+from posekit.camera import Camera
 from posekit.errors import MeshError
-from posekit.geometry import Pose, random_rotation, rotation_angle
+from posekit.geometry import Pose, cube_views, random_rotation, rotation_angle, so3_exp
 from posekit.object_model import ObjectModel, Symmetries, smooth_normals
+from posekit.render import Renderer
 
 BOX = trimesh.creation.box((0.10, 0.06, 0.04))
 CORNERS = np.asarray(BOX.vertices) + (0.3, 0.0, -0.1)  # its origin is far from its centre
@@ -317,6 +320,34 @@ def test_diameter_is_the_largest_distance(seed: int) -> None:
 def test_diameter_of_a_hull_with_very_many_corners() -> None:
     directions = trimesh.creation.icosphere(5, 0.05)
     assert ObjectModel.from_arrays(directions.vertices, directions.faces).diameter == pytest.approx(0.1, rel=1e-3)
+
+
+@pytest.mark.parametrize("textured", [False, True])
+def test_a_simplified_mesh_looks_the_same(textured: bool) -> None:
+    """Shape, colours and texture, seams included: six sides of a box lie apart in its texture."""
+    vertices, faces = cuboid((-0.05, -0.04, -0.03), (0.05, 0.04, 0.03), cells=24)
+    vertices = vertices + 0.004 * np.sin(60 * vertices[:, [1, 2, 0]])  # not quite flat
+    colors = (120 + 100 * np.sin(40 * vertices[:, [2, 0, 1]])).astype(np.uint8)
+    more = {"colors": colors}
+    if textured:
+        side, place = np.divmod(np.arange(len(vertices)), 25 * 25)
+        u, v = np.divmod(place, 25)
+        uvs = np.stack([(side % 3 + 0.1 + 0.8 * u / 24) / 3, (side // 3 + 0.1 + 0.8 * v / 24) / 2], axis=1)
+        rows, columns = np.mgrid[:256, :384]
+        picture = np.stack([rows, columns % 200, 40 * (rows // 128) + 60 * (columns // 128)], axis=2)
+        more = {"uvs": uvs, "texture": picture.astype(np.uint8)}
+    whole = ObjectModel.from_arrays(vertices, faces, symmetries=Symmetries.parse("z:2", np.zeros(3)), **more)
+    fewer = whole.simplified(1500)
+    assert len(whole.faces) == 6912 and len(fewer.faces) <= 1500 and whole.simplified(7000) is whole
+    assert fewer.symmetries is whole.symmetries and fewer.name == whole.name
+    camera, renderer = Camera.from_fov(0.4, 160, 120), Renderer()
+    for view in cube_views():
+        pose = Pose(so3_exp(np.array([0.5, 0.4, 0.3])) @ view, np.array([0, 0, 0.4]))
+        [before], [after] = (renderer.render(model, [pose], [camera]) for model in (whole, fewer))
+        both = before.mask & after.mask
+        assert both.sum() > 0.985 * (before.mask | after.mask).sum()
+        assert np.percentile(np.linalg.norm(before.coords - after.coords, axis=2)[both], 95) < 0.001
+        assert np.abs(before.image[both].astype(float) - after.image[both]).mean() < 4
 
 
 def test_points_are_spread_over_the_surface_and_repeatable() -> None:

@@ -19,7 +19,7 @@ from posekit.pnp import projection_jacobian
 
 Array = NDArray[np.float64]
 
-STILL = 1e-4  # a step in radians, or in distances of the object, that ends the loop
+STILL = 5e-4  # a step in radians, or in distances of the object, that ends the loop
 NEAREST = 1e-3  # metres before the camera
 
 

@@ -13,11 +13,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import fast_simplification
 import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, KDTree
 from scipy.spatial.distance import pdist
 
 from posekit.errors import MeshError
@@ -291,6 +292,30 @@ class ObjectModel:
     def T_obj_ctr(self) -> Pose:
         return Pose.translation(self.center)
 
+    def simplified(self, faces: int) -> ObjectModel:
+        """The same object with about so many faces, to be drawn small and often; itself where it has no more.
+
+        Its shape errs least for its number of faces (quadric error metrics: Garland and Heckbert, 1997). Colours are
+        means of those near by; a face's place in the texture is that of the face that lay at its middle.
+        """
+        if len(self.faces) <= faces:
+            return self
+        places = _same_places(self.vertices.astype(np.float64))
+        _, first, welded = np.unique(places, return_index=True, return_inverse=True)
+        vertices, kept = fast_simplification.simplify(
+            self.vertices[first], welded[self.faces].astype(np.int32), target_count=faces
+        )
+        colors = uvs = None
+        if self.colors is not None:
+            colors = _mean_colors(vertices, self.vertices, self.colors)
+        if self.uvs is not None:
+            source, kept, uvs = _carried_uvs(vertices, kept, self.vertices[self.faces], self.uvs[self.faces])
+            vertices = vertices[source]
+        model = ObjectModel.from_arrays(
+            vertices, kept, name=self.name, colors=colors, uvs=uvs, texture=self.texture, symmetries=self.symmetries
+        )
+        return replace(model, units=self.units)
+
     def sample_points(self, n: int, seed: int = 0) -> Floats:
         """(n, 3) points spread evenly over the surface, in ``obj``. The same seed gives the same points."""
         rng = np.random.default_rng(seed)
@@ -357,6 +382,52 @@ def _areas(vertices: Floats, faces: NDArray[Any]) -> Floats:
     corners = vertices[faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return np.asarray(0.5 * np.linalg.norm(cross, axis=1))
+
+
+def _mean_colors(
+    fewer: NDArray[np.float32], vertices: NDArray[np.float32], colors: NDArray[np.uint8]
+) -> NDArray[np.uint8]:
+    """Of the vertices that each of fewer ones (V, 3) is nearest to; where there are none, of the nearest."""
+    _, owner = KDTree(fewer).query(vertices)
+    count = np.bincount(owner, minlength=len(fewer))
+    sums = np.stack([np.bincount(owner, channel, minlength=len(fewer)) for channel in colors.T], axis=1)
+    _, nearest = KDTree(vertices).query(fewer)
+    means = np.where(count[:, None] > 0, sums / np.maximum(count, 1)[:, None], colors[nearest])
+    return np.asarray(np.rint(means), np.uint8)
+
+
+def _carried_uvs(
+    vertices: NDArray[np.float32], faces: NDArray[Any], corners: NDArray[np.float32], corner_uvs: NDArray[np.float32]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:
+    """Texture coordinates for a simplified mesh: those of the plane of the old face nearest to a new face's middle.
+
+    corners: (F, 3, 3), corner_uvs: (F, 3, 2), the old faces'. A vertex on a seam is split. Returns the source vertex of
+    each new one (V',), the new faces and the coordinates (V', 2).
+    """
+    new = vertices[faces].astype(np.float64)
+    _, under = KDTree(corners.mean(axis=1)).query(new.mean(axis=1))
+    origin, first, second = np.moveaxis(corners[under].astype(np.float64), 1, 0)
+    sides = np.stack([first - origin, second - origin], axis=2)  # (F', 3, 2)
+    shares = np.einsum("fij,fkj->fki", np.linalg.pinv(sides), new - origin[:, None]).clip(-4, 4)  # a sliver's explode
+    start = corner_uvs[under, 0].astype(np.float64)
+    across = corner_uvs[under, 1:].astype(np.float64) - start[:, None]
+    uvs = (start[:, None] + shares @ across).reshape(-1, 2)
+    spans = np.linalg.norm(np.diff(uvs.reshape(-1, 3, 2), axis=1), axis=2)
+    near = 2 * float(np.percentile(spans, 95))  # what lies further apart is another place of the texture
+    vertex, left = faces.ravel(), np.arange(faces.size)
+    source: list[NDArray[np.int64]] = []
+    means: list[Floats] = []
+    index, count = np.zeros(faces.size, np.int64), 0
+    while left.size:  # corners of a vertex that agree become one, then those that did not agree with them
+        owners, head, owner = np.unique(vertex[left], return_index=True, return_inverse=True)
+        agree = np.linalg.norm(uvs[left] - uvs[left[head]][owner], axis=1) <= near
+        number = np.bincount(owner[agree], minlength=len(owners))[:, None]
+        sums = [np.bincount(owner[agree], uvs[left[agree], k], minlength=len(owners)) for k in (0, 1)]
+        means.append(np.stack(sums, axis=1) / number)
+        source.append(owners.astype(np.int64))
+        index[left[agree]] = count + owner[agree]
+        left, count = left[~agree], count + len(owners)
+    return np.concatenate(source), index.reshape(-1, 3), np.concatenate(means)
 
 
 def _hull(points: Floats) -> Floats:

@@ -8,6 +8,7 @@ frame, do not drift; they need a texture that the mesh has too.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -17,6 +18,7 @@ from posekit.camera import Zoom
 from posekit.fusion import Points
 from posekit.geometry import Pose
 from posekit.object_model import ObjectModel
+from posekit.region import Outline, find_outline
 from posekit.view import View
 
 WINDOW, LEVELS = (13, 13), 3
@@ -43,6 +45,30 @@ class Look:
     T_view_ctr: Pose
     visible: NDArray[np.bool_]
 
+    @cached_property
+    def grey(self) -> NDArray[np.uint8]:
+        """What the frame shows (H, W)."""
+        return np.asarray(cv2.cvtColor(self.seen.image, cv2.COLOR_RGB2GRAY))
+
+    @cached_property
+    def corners(self) -> NDArray[np.float32]:
+        """Pixels (N, 1, 2) of the object that can be followed into the next frame."""
+        assert self.drawn.mask is not None
+        solid = self.drawn.mask & self.visible & (self.grey > 0)
+        inside = cv2.erode(solid.astype(np.uint8), np.ones((5, 5), np.uint8))
+        corners = cv2.goodFeaturesToTrack(self.grey, CORNERS, QUALITY, APART, mask=inside)
+        return np.zeros((0, 1, 2), np.float32) if corners is None else np.asarray(corners, np.float32)
+
+    @cached_property
+    def outline(self) -> Outline:
+        """Of the drawn mesh."""
+        assert self.drawn.mask is not None
+        return find_outline(self.drawn.mask)
+
+    def prepare(self) -> None:
+        """Find now what the next frame is going to need."""
+        self.corners, self.outline  # noqa: B018 - they keep what they find
+
     def again(self, view: View) -> View:
         """The same crop of the next frame."""
         return view.zoomed(Zoom(view.camera, self.seen.camera, self.seen.R_view_cam))
@@ -54,15 +80,14 @@ def follow_points(before: Look, pose: Pose, after: View, model: ObjectModel) -> 
     before: the last frame's crop; pose: ``T_view_ctr`` in it, near the one at which it was drawn. after: the same crop
     of the next frame. None where too few can be followed.
     """
-    drawn, camera = before.drawn, before.drawn.camera
+    drawn, camera, corners = before.drawn, before.drawn.camera, before.corners
     assert drawn.mask is not None and drawn.coords is not None
-    first, second = (cv2.cvtColor(v.image, cv2.COLOR_RGB2GRAY) for v in (before.seen, after))
-    solid = drawn.mask & before.visible & before.seen.shown & after.shown
-    inside = cv2.erode(solid.astype(np.uint8), np.ones((5, 5), np.uint8))
-    corners = cv2.goodFeaturesToTrack(first, CORNERS, QUALITY, APART, mask=inside)
-    if corners is None or len(corners) < LEAST:
+    second = cv2.cvtColor(after.image, cv2.COLOR_RGB2GRAY)
+    shown = cv2.erode((second > 0).astype(np.uint8), np.ones((5, 5), np.uint8))
+    corners = corners[shown[tuple(corners[:, 0].astype(int).T[::-1])] > 0]
+    if len(corners) < LEAST:
         return None
-    places, steady = _followed(first, second, corners)
+    places, steady = _followed(before.grey, second, corners)
     corners = corners[:, 0]
     # which point of the mesh is seen at a corner: the one drawn where the corner was, before the pose was corrected
     here = drawn.coords[tuple(np.rint(corners).astype(int).T[::-1])] - model.center

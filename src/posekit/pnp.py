@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from posekit.camera import Camera
-from posekit.geometry import Pose, hat, nearest_rotation, so3_exp
+from posekit.geometry import Pose, nearest_rotation, so3_exp
 
 Array = NDArray[np.float64]
 
@@ -71,8 +71,14 @@ def solve_pnp(
 
 def projection_jacobian(p: Array, q: Array, camera: Camera) -> Array:
     """d project(exp(w) p + t) / d(w, t) at zero; p: (N, 3) rotated points, q = p + t -> (N, 2, 6)."""
-    z = q[:, 2]
-    d = np.zeros((len(q), 2, 3))
-    d[:, 0, 0], d[:, 0, 2] = camera.fx / z, -camera.fx * q[:, 0] / z**2
-    d[:, 1, 1], d[:, 1, 2] = camera.fy / z, -camera.fy * q[:, 1] / z**2
-    return np.concatenate([d @ -hat(p), d], axis=2)
+    x, y, z = p.T
+    depth = q[:, 2]
+    right, down = camera.fx / depth, camera.fy / depth
+    across, along = -right * q[:, 0] / depth, -down * q[:, 1] / depth
+    none = np.zeros(len(q))
+    # a row d of the derivative by t gives p x d by w
+    rows = [
+        [y * across, z * right - x * across, -y * right, right, none, across],
+        [y * along - z * down, -x * along, x * down, none, down, along],
+    ]
+    return np.array(rows).transpose(2, 0, 1)

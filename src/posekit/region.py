@@ -8,6 +8,7 @@ Stoiber et al., 2022). This takes no texture, no edges and no training, and does
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ from posekit.view import View
 Array = NDArray[np.float64]
 FArray = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+Outline = tuple[FArray, FArray]
 
 BINS = 32  # of each channel
 COUNT = 240  # lines at most
@@ -46,11 +48,15 @@ class Colours:
             (1 - share) * self.inside + share * newer.inside, (1 - share) * self.outside + share * newer.outside
         )
 
+    @cached_property
+    def chance(self) -> FArray:
+        """(BINS**3,), that a pixel of this colour is the object's."""
+        inside, outside = self.inside + np.float32(1e-6), self.outside + np.float32(1e-6)
+        return np.asarray(inside / (inside + outside), np.float32)
+
     def posterior(self, image: NDArray[np.uint8]) -> FArray:
         """The chance (...) that a pixel of this colour is the object's; image: uint8 RGB (..., 3)."""
-        index = _index(image)
-        inside, outside = self.inside[index] + 1e-6, self.outside[index] + 1e-6
-        return np.asarray(inside / (inside + outside), np.float32)
+        return np.asarray(self.chance[_index(image)], np.float32)
 
     def seen(self, view: View) -> Mask:
         """Where (H, W) the colours are rather the object's."""
@@ -99,15 +105,17 @@ def like_mesh(view: View, drawn: View) -> Mask:
 
 def off_colour(view: View, drawn: View) -> FArray:
     """How far (H, W, 3) the chromaticities of a frame's crop are from those of the mesh drawn there."""
-    return _chromaticity(view.image) - _chromaticity(drawn.image)
+    return chromaticity(view.image) - chromaticity(drawn.image)
 
 
-def outline_lines(view: View, drawn: View, colours: Colours, seen: Mask, center: Array) -> Lines | None:
+def outline_lines(
+    view: View, drawn: View, colours: Colours, seen: Mask, center: Array, outline: Outline | None = None
+) -> Lines | None:
     """Where the outline of ``drawn`` (mask and coords) should lie in a frame's crop of the same camera; None where too
     little of it can be told. seen: (H, W), what the crop shows of the object: outlines elsewhere are not believed.
-    center: (3,), the model's."""
+    center: (3,), the model's. outline: of ``drawn.mask``, where it is known already."""
     assert drawn.mask is not None and drawn.coords is not None
-    pixels, normals = _outline(drawn.mask)
+    pixels, normals = outline or find_outline(drawn.mask)
     if len(pixels) < LEAST:
         return None
     along = np.arange(-REACH - TAIL, REACH + TAIL + 1, dtype=np.float32)
@@ -130,7 +138,7 @@ def outline_lines(view: View, drawn: View, colours: Colours, seen: Mask, center:
     return Lines(*(array.astype(np.float64) for array in (points, places[usable], normals[usable], sigma[usable])))
 
 
-def _outline(mask: Mask) -> tuple[FArray, FArray]:
+def find_outline(mask: Mask) -> Outline:
     """Pixels (N, 2) of the mask's outline, but for those at the crop's edge, and its normals (N, 2), outwards."""
     edge = mask & (cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
     edge[[0, -1]] = edge[:, [0, -1]] = False
@@ -167,7 +175,8 @@ def _pixels(places: FArray, view: View) -> tuple[NDArray[np.intp], Mask]:
 
 
 def _index(image: NDArray[np.uint8]) -> NDArray[np.intp]:
-    return np.asarray((image // (256 // BINS)) @ np.array([BINS**2, BINS, 1], np.intp))
+    bins = (image // (256 // BINS)).astype(np.uint16)
+    return np.asarray((bins[..., 0] * BINS + bins[..., 1]) * BINS + bins[..., 2], np.intp)
 
 
 def _histogram(index: NDArray[np.intp]) -> FArray:
@@ -177,7 +186,8 @@ def _histogram(index: NDArray[np.intp]) -> FArray:
     return np.asarray(counts.ravel() / max(1.0, float(counts.sum())), np.float32)
 
 
-def _chromaticity(image: NDArray[np.uint8]) -> FArray:
+def chromaticity(image: NDArray[np.uint8]) -> FArray:
+    """Each channel's share (H, W, 3) of a smoothed picture's brightness."""
     smooth = cv2.GaussianBlur(image, (0, 0), 1.0).astype(np.float32) + 8
     return np.asarray(smooth / _sum(smooth)[..., None], np.float32)
 

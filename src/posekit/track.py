@@ -11,7 +11,7 @@ import math
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -23,6 +23,7 @@ from posekit.estimate import PoseEstimator
 from posekit.fusion import Belief, Points, Term, fuse
 from posekit.geometry import Pose, rotation_angle, so3_exp, so3_log
 from posekit.nets.pose_delta import apply_delta
+from posekit.nets.precision import usable_cores
 from posekit.nets.predictor import PairPrediction, Predictor
 from posekit.object_model import ObjectModel
 from posekit.odometry import Look, follow_points, match_texture
@@ -41,6 +42,7 @@ UNSEEN = (6.0, 4.0, 0.02)  # of that motion, when nothing else is known about it
 SUREST = (0.3, 0.1, 0.003)  # of any pose: errors last over many frames
 TOGETHER, DOUBTED = 25.0, math.radians(4.0)  # so many correspondences err alike, and at this predicted angle twice that
 TINTED = 0.15  # share of a frame in what is known of the tint
+FACES = 6000  # of the mesh that is drawn: a crop shows no more
 LEAST_SCALE, KNEE = 0.5, 2.5  # pixels, no correspondence is more exact; standard deviations
 
 
@@ -143,6 +145,7 @@ class Tracker:
         self.estimator = estimator or PoseEstimator(model)
         self.predictor = predictor or _predictor(self.estimator, config)
         self.renderer, self.detector = self.estimator.renderer, detector
+        self._drawn = model.simplified(FACES)
         self._outline = model.outline - model.center
         self._beside = ThreadPoolExecutor(1, "posekit-network")
         self._given = pose  # a first pose that no frame has been seen with
@@ -199,7 +202,7 @@ class Tracker:
         started, network, angle, comparisons = time.perf_counter(), 0.0, 0.0, 0
         before, colours, tint = self._before, self._colours, self._tint
         assert before is not None and colours is not None and tint is not None
-        ahead = self._ahead(view, before, last, colours, tint)
+        ahead = self._ahead(view, before, last, colours)
         belief = ahead
         while comparisons < self.config.iterations:
             comparisons += 1
@@ -211,9 +214,12 @@ class Tracker:
             apart = off_colour(seen, drawn)
             visible = colours.seen(seen) & ~tint.hides(apart, drawn.mask)
             answer = self._beside.submit(self._asked, seen, drawn, visible)
+            # while the network thinks
             look = Look(seen, drawn, Pose.rotation(seen.R_view_cam) @ belief.pose, visible)
-            others = self._lines(look, colours) + self._texture(look)  # while the network thinks
-            newer = learn(seen, drawn.mask, visible)
+            others = self._lines(look, seen, visible, colours) + self._texture(look)
+            learned = colours.mixed(learn(seen, drawn.mask, visible), self.config.learn)
+            tinted = tint.mixed(Tint.of(apart, visible & drawn.mask), TINTED)
+            look.prepare()
             prediction, seconds = answer.result()
             network, angle = network + seconds, prediction.angle
             agreed = self._agreed(ahead, look, prediction, others)
@@ -232,12 +238,12 @@ class Tracker:
         self._motion = Pose(belief.pose.R @ last.pose.R.T, belief.pose.t - last.pose.t)
         self._belief, self._before = belief, look
         if angle < math.radians(self.config.restart_deg) and share > self.config.alike:
-            self._colours = colours.mixed(newer, self.config.learn)
-        self._tint = tint.mixed(Tint.of(apart, visible & drawn.mask), TINTED)
+            self._colours = learned
+        self._tint = tinted
         timings = {"network": network, "total": time.perf_counter() - started}
         return self._estimate(view, pose, angle, comparisons, share, timings)
 
-    def _ahead(self, view: View, before: Look, last: Belief, colours: Colours, tint: Tint) -> Belief:
+    def _ahead(self, view: View, before: Look, last: Belief, colours: Colours) -> Belief:
         """Where the object is expected, as ``T_cam_ctr``: from the last frame, without a comparison with the mesh."""
         camera, R = before.drawn.camera, before.seen.R_view_cam
         believed = last.turned(R)
@@ -245,14 +251,11 @@ class Tracker:
         known: list[Term] = [_about(start, camera, AHEAD)]
         motion: list[Term] = [_about(start, camera, UNSEEN)]
         seen = before.again(view)
-        if self.config.motion == "points":
-            points = follow_points(before, start, seen, self.model)
-            if points is not None:
-                known.append(points)
-                motion.append(points)
-        assert before.drawn.mask is not None
-        visible = colours.seen(seen) & ~tint.hides(off_colour(seen, before.drawn), before.drawn.mask)
-        lines = self._lines(replace(before, seen=seen, visible=visible), colours)
+        following = self._beside.submit(self._followed, before, start, seen)
+        lines = self._lines(before, seen, before.visible, colours)
+        points = following.result()
+        known += points
+        motion += points
         found = fuse(start, [*known, *lines], camera)
         pose = start if found is None else found.pose
         moved = np.sum([term.equations(pose, camera)[0] for term in motion], axis=0)
@@ -278,19 +281,24 @@ class Tracker:
             return None
         return found.spread(_about(found.pose, camera, SUREST).covariance).turned(R.T)
 
+    def _followed(self, before: Look, start: Pose, seen: View) -> list[Term]:
+        found = follow_points(before, start, seen, self.model) if self.config.motion == "points" else None
+        return [] if found is None else [found]
+
     def _texture(self, look: Look) -> list[Term]:
         found = match_texture(look, self.model) if self.config.texture else None
         return [] if found is None else [found]
 
-    def _lines(self, look: Look, colours: Colours) -> list[Term]:
+    def _lines(self, look: Look, seen: View, visible: NDArray[np.bool_], colours: Colours) -> list[Term]:
+        """Where the mesh's outline, as it was drawn for ``look``, lies in a crop of the same camera."""
         if not self.config.outline:
             return []
-        lines = outline_lines(look.seen, look.drawn, colours, look.visible, self.model.center)
+        lines = outline_lines(seen, look.drawn, colours, visible, self.model.center, look.outline)
         return [] if lines is None else [lines]
 
     def _crops(self, view: View, pose: Pose) -> tuple[View, View]:
         """What the frame shows round a ``T_cam_obj``, and the mesh drawn there."""
-        [seen], [drawn] = crops(view, self.model, self._outline, [pose], self.predictor.size, self.renderer)
+        [seen], [drawn] = crops(view, self._drawn, self._outline, [pose], self.predictor.size, self.renderer)
         return seen, drawn
 
     def _asked(self, seen: View, drawn: View, visible: NDArray[np.bool_]) -> tuple[PairPrediction, float]:
@@ -369,7 +377,7 @@ def _predictor(estimator: PoseEstimator, config: TrackConfig) -> Predictor:
         return estimator.predictor
     from posekit.nets.openvino import OpenVinoPredictor
 
-    return OpenVinoPredictor(estimator.networks)
+    return OpenVinoPredictor(estimator.networks, threads=max(1, usable_cores() // 2))  # the rest works beside it
 
 
 def _before_camera(points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import platform
 import subprocess
 from collections.abc import Mapping
@@ -16,6 +15,7 @@ import numpy as np
 from posekit._version import __version__
 from posekit.data.datasets import DatasetInfo
 from posekit.evaluate.scoring import MEASURES, Scored
+from posekit.nets.precision import usable_cores
 
 SCHEMA = 1
 AP_MEASURES = ("mssd_ap", "mspd_ap", "ap")
@@ -63,11 +63,7 @@ def machine() -> str:
         model = next(line.split(":", 1)[1].strip() for line in text.splitlines() if line.startswith("model name"))
     except (OSError, StopIteration):
         model = platform.processor() or platform.machine()
-    return f"{model}, {_cores()} cores, {platform.system()}"
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return f"{model}, {usable_cores()} cores, {platform.system()}"
 
 
 def novelty(seen: frozenset[str] | None, digest: str) -> str:

@@ -1,7 +1,8 @@
-"""Whether to compute in bfloat16. Layer 2."""
+"""What the hardware offers: bfloat16, cores. Layer 2."""
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import torch
@@ -14,3 +15,8 @@ def has_fast_bfloat16(device: str) -> bool:
         return torch.cuda.is_bf16_supported()
     ask: Any = getattr(torch.cpu, "get_capabilities", dict)  # older versions of torch do not tell
     return bool(ask().get("amx_bf16"))
+
+
+def usable_cores() -> int:
+    """Of the processor, by this process."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
