@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -28,7 +29,7 @@ from posekit.object_model import ObjectModel
 from posekit.odometry import Look, follow_points, match_texture
 from posekit.recording import Recorder
 from posekit.refine import crops
-from posekit.region import Tint, learn, off_colour, outline_lines
+from posekit.region import Tint, fit_outline, learn, off_colour, outline_lines
 from posekit.render import Renderer
 from posekit.results import Detection, Estimate
 from posekit.track import LOST, RESTARTED, TRACKED, TrackConfig, Tracker
@@ -183,6 +184,35 @@ def test_an_outline_is_found_by_its_colours(model: ObjectModel, renderer: Render
     pose = Pose.rotation(beside.seen.R_view_cam.T) @ found.pose @ model.T_obj_ctr.inverse()
     turn, shift = pose_error(pose, path(model, 0))
     assert np.rad2deg(turn) < 0.7 and shift < 0.002
+
+
+def test_blurred_edges_do_not_move_the_outline(model: ObjectModel, renderer: Renderer) -> None:
+    """Pixels that mix two colours are like neither, and more like one of them by chance: here the object's, whose rim
+    teaches them, while its surroundings have many colours."""
+    view = photograph(renderer, model, path(model, 0))
+    blocks = np.random.default_rng(3).integers(0, 255, (60, 80, 3)).astype(np.uint8)
+    many = cv2.resize(blocks, (640, 480), interpolation=cv2.INTER_NEAREST)
+    image = np.where(view.mask[..., None], np.uint8([230, 60, 50]), many)
+    blurred = View(cv2.GaussianBlur(image, (0, 0), 2.0), CAMERA)
+    at = looked(blurred, model, renderer, path(model, 0))
+    assert at.drawn.mask is not None
+    colours = learn(at.seen, at.drawn.mask, at.visible)
+    lines = outline_lines(at.seen, at.drawn, colours, colours.seen(at.seen), model.center)
+    assert lines is not None
+    there = at.drawn.camera.project(at.T_view_ctr.apply(lines.points))
+    off = np.einsum("ni,ni->n", lines.places - there, lines.normals)
+    assert abs(np.median(off)) < 0.35, "pixels of the crop"
+
+
+def test_a_pose_is_laid_onto_the_outline_that_colours_show(model: ObjectModel, renderer: Renderer) -> None:
+    view = photograph(renderer, model, path(model, 0))
+    for off in (1.0, 2.0):
+        found = fit_outline(view, model, path(model, off), renderer, (160, 120))
+        assert found is not None
+        before, after = (pose_error(p, path(model, 0)) for p in (path(model, off), found))
+        assert after[0] < 0.6 * before[0] and after[1] < 0.5 * before[1]
+    flat = View(np.full_like(view.image, 128), CAMERA)
+    assert fit_outline(flat, model, path(model, 0), renderer, (160, 120)) is None
 
 
 def test_an_outline_is_not_sought_where_the_object_is_hidden(model: ObjectModel, renderer: Renderer) -> None:

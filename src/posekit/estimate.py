@@ -26,6 +26,7 @@ from posekit.nets.predictor import NetworkPredictor
 from posekit.nets.weights import load_networks
 from posekit.object_model import ObjectModel
 from posekit.refine import Refinement, RefineOptions, compare, refine
+from posekit.region import fit_outline
 from posekit.render import Renderer
 from posekit.results import Detection, Estimate
 from posekit.view import View
@@ -42,7 +43,8 @@ class EstimateOptions:
     """init: where first poses come from. hypotheses: how many of them are refined, for each of a detection's masks.
     beside: whether poses beside a known
     one are tried too where it does not converge at once. contour: whether the pose is laid onto the mask's outline
-    where the mask proves exact. seed: for whatever is drawn at random. The rest is
+    where the mask proves exact. outline: whether it is laid onto the one that the photograph's colours show where there
+    is no such mask. seed: for whatever is drawn at random. The rest is
     RefineOptions', with the angle in degrees."""
 
     init: str = "templates"
@@ -54,6 +56,7 @@ class EstimateOptions:
     seed: int = 0
     beside: bool = True
     contour: bool = True
+    outline: bool = True
 
     def __post_init__(self) -> None:
         if self.init not in INITS:
@@ -136,8 +139,8 @@ class PoseEstimator:
         options = self.options.refine_options
         if len(starts) <= FINALISTS or options.iterations <= HEATS:
             return refine(view, self.model, starts, self.predictor, self.renderer, options)
-        heats = self._best(view, self._heats(view, starts, FIRST), SEMIFINALISTS)
-        heats = self._onward(view, heats, HEATS - FIRST)
+        heats = self._best(view, self._on_outline(view, self._heats(view, starts, FIRST)), SEMIFINALISTS)
+        heats = self._on_outline(view, self._onward(view, heats, HEATS - FIRST))
         if least > 0 and self._presence(view, self._best(view, heats, 1)[0].T_cam_obj) < least:
             return heats
         return self._finals(view, heats)
@@ -193,14 +196,21 @@ class PoseEstimator:
         )
 
     def _on_contour(self, view: View, refined: Refinement) -> Refinement:
-        """With its outline on the mask's, where there is an exact one; the angle is then the fit's."""
-        if not self.options.contour or view.mask is None:
-            return refined
-        fit = fit_contour(view, self.model, refined.T_cam_obj, self.renderer)
-        if fit is None or not fit.exact:
-            return refined
-        converged = fit.turn_std < self.options.refine_options.stop_angle
-        return replace(refined, T_cam_obj=fit.T_cam_obj, angle=fit.turn_std, converged=converged)
+        """With its outline on the mask's, where there is an exact one; the angle is then the fit's. Else on the one
+        that the colours show."""
+        if self.options.contour and view.mask is not None:
+            fit = fit_contour(view, self.model, refined.T_cam_obj, self.renderer)
+            if fit is not None and fit.exact:
+                converged = fit.turn_std < self.options.refine_options.stop_angle
+                return replace(refined, T_cam_obj=fit.T_cam_obj, angle=fit.turn_std, converged=converged)
+        return self._on_outline(view, [refined])[0]
+
+    def _on_outline(self, view: View, refined: Sequence[Refinement]) -> list[Refinement]:
+        """Each with its outline where the photograph's colours change; as it is where these do not tell."""
+        if not self.options.outline:
+            return list(refined)
+        poses = [fit_outline(view, self.model, r.T_cam_obj, self.renderer, self.predictor.size) for r in refined]
+        return [r if pose is None else replace(r, T_cam_obj=pose) for r, pose in zip(refined, poses, strict=True)]
 
     def _presence(self, view: View, T_cam_obj: Pose) -> float:
         """How sure it is that the photograph shows the object there: by what the network sees of it."""

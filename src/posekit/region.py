@@ -14,8 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from posekit.fusion import Lines
+from posekit.fusion import Belief, Lines, fuse
+from posekit.geometry import Pose
+from posekit.object_model import ObjectModel
+from posekit.render import Renderer
 from posekit.view import View
+from posekit.zoom import zoom_to_pose
 
 Array = NDArray[np.float64]
 FArray = NDArray[np.float32]
@@ -28,11 +32,14 @@ REACH, TAIL = 6, 4  # pixels: how far an outline is looked for, and what is look
 CLEAR, SOFT = 0.42, 0.7  # the step between inside and outside: half its height, and its width in pixels
 SIGMA = 0.5  # pixels, no outline is surer
 LEAST = 20  # lines
+MIXED, BOTH, EDGE = 2, 2, 30.0  # pixels to either side that mix colours, that show them, and a clear step's grey values
 GAP, RING = 1, 14  # pixels beside the outline that teach no colours, and how far the surroundings reach
 BLUR = 1.0  # pixels over which neighbours decide together whose they are
 HUE = 0.12  # distance of chromaticities beyond which a pixel is not the mesh's
 SUDDEN, SMOOTH = 0.12, 1.0  # the same beyond what it has been before; pixels over which that is averaged
 HIDDEN, BESIDE = 2, 5  # pixels: how deep a hidden part is that no pose's error explains, and how far it spoils outlines
+STEPS, LEAST_SEEN = 4, 0.15  # of a fit; share of the silhouette with the mesh's hues below which they say nothing
+LOOSE = (30.0, 8.0, 0.1)  # standard deviations of the pose that a fit starts from: degrees, pixels, share of distance
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,9 +127,11 @@ def outline_lines(
         return None
     along = np.arange(-REACH - TAIL, REACH + TAIL + 1, dtype=np.float32)
     at, inside = _pixels(pixels[:, None] + normals[:, None] * along[None, :, None], view)
-    posterior = colours.posterior(view.image[at[..., 1], at[..., 0]])
+    image = view.image[at[..., 1], at[..., 0]]
+    posterior = colours.posterior(image)
     posterior[~inside] = 0.5
     mean, sigma = _offsets(posterior, along)
+    mean = _halfway(image, mean)
     places = pixels + normals * mean[:, None]
     there, _ = _pixels(places, view)
     near = cv2.dilate(seen.astype(np.uint8), np.ones((5, 5), np.uint8))[there[:, 1], there[:, 0]] > 0
@@ -136,6 +145,47 @@ def outline_lines(
     columns, rows = pixels[usable].astype(int).T
     points = drawn.coords[rows, columns].astype(np.float64) - center
     return Lines(*(array.astype(np.float64) for array in (points, places[usable], normals[usable], sigma[usable])))
+
+
+def fit_outline(
+    view: View,
+    model: ObjectModel,
+    T_cam_obj: Pose,
+    renderer: Renderer,
+    size: tuple[int, int],
+    steps: int = STEPS,
+    seen: Mask | None = None,
+) -> Pose | None:
+    """The ``T_cam_obj`` whose outline lies where the photograph's colours change from the object's to its ground's.
+
+    Colours are learned from the pose's own silhouette, again at every step. seen: (H, W) of the photograph, what shows
+    the object; None = what has the mesh's hues. size: (width, height) of the crops. None where too little of the
+    outline can be told.
+    """
+    outline, pose, colours = model.outline - model.center, T_cam_obj, None
+    prior: Belief | None = None
+    for _ in range(steps):
+        zoom = zoom_to_pose(view.camera, pose @ model.T_obj_ctr, outline, size)
+        shown = view.with_mask(seen).zoomed(zoom)
+        [drawn] = renderer.render(model, [Pose.rotation(zoom.R_view_cam) @ pose], [zoom.camera])
+        assert drawn.mask is not None
+        visible = like_mesh(shown, drawn) if shown.mask is None else shown.mask
+        if (visible & drawn.mask).sum() < LEAST_SEEN * drawn.mask.sum():
+            visible = np.ones_like(visible)
+        newer = learn(shown, drawn.mask, visible)
+        colours = newer if colours is None else colours.mixed(newer, 0.5)
+        lines = outline_lines(shown, drawn, colours, colours.seen(shown), model.center)
+        if lines is None:
+            return None
+        T_view_ctr = Pose.rotation(zoom.R_view_cam) @ pose @ model.T_obj_ctr
+        if prior is None:
+            turn, shift, depth = LOOSE
+            prior = Belief.about(T_view_ctr, zoom.camera, np.deg2rad(turn), shift, depth).turned(zoom.R_view_cam.T)
+        found = fuse(T_view_ctr, [prior.turned(zoom.R_view_cam), lines], zoom.camera)
+        if found is None or found.pose.t[2] < 0.6 * model.diameter:
+            return None
+        pose = Pose.rotation(zoom.R_view_cam.T) @ found.pose @ model.T_obj_ctr.inverse()
+    return pose
 
 
 def find_outline(mask: Mask) -> Outline:
@@ -164,6 +214,24 @@ def _offsets(posterior: FArray, along: FArray) -> tuple[FArray, FArray]:
     mean = weight @ shifts
     variance = (weight * (shifts - mean[:, None]) ** 2).sum(axis=1)
     return mean, np.sqrt(np.maximum(variance, SIGMA**2))
+
+
+def _halfway(image: NDArray[np.uint8], mean: FArray) -> FArray:
+    """Offsets (N,) again, where each line (N, S, 3) is halfway between the colours on either side.
+
+    Pixels that mix the two are like neither, and by their chances the object's or its surroundings' depending on what
+    colours these have: outlines found by chances alone lie up to a pixel too far out or in.
+    """
+    middle = np.rint(mean).astype(np.intp)
+    window = middle[:, None] + np.arange(-MIXED - BOTH, MIXED + BOTH + 1) + image.shape[1] // 2
+    colours = np.take_along_axis(image, window.clip(0, image.shape[1] - 1)[..., None], axis=1).astype(np.float32)
+    inner, outer = colours[:, :BOTH].mean(axis=1), colours[:, -BOTH:].mean(axis=1)
+    step = outer - inner
+    size = np.einsum("ni,ni->n", step, step)
+    share = 1 - np.einsum("nsi,ni->ns", colours[:, BOTH:-BOTH] - inner[:, None], step) / np.maximum(size, 1)[:, None]
+    found = middle - MIXED - 1 + share.clip(0, 1).sum(axis=1)
+    clear = (size > EDGE**2) & (np.abs(found - mean) < MIXED)
+    return np.asarray(np.where(clear, found, mean), np.float32)
 
 
 def _pixels(places: FArray, view: View) -> tuple[NDArray[np.intp], Mask]:
