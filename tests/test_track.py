@@ -207,12 +207,12 @@ def test_blurred_edges_do_not_move_the_outline(model: ObjectModel, renderer: Ren
 def test_a_pose_is_laid_onto_the_outline_that_colours_show(model: ObjectModel, renderer: Renderer) -> None:
     view = photograph(renderer, model, path(model, 0))
     for off in (1.0, 2.0):
-        found = fit_outline(view, model, path(model, off), renderer, (160, 120))
+        found = fit_outline(view, model, path(model, off), renderer, (160, 120), 0.1)
         assert found is not None
         before, after = (pose_error(p, path(model, 0)) for p in (path(model, off), found))
         assert after[0] < 0.6 * before[0] and after[1] < 0.5 * before[1]
     flat = View(np.full_like(view.image, 128), CAMERA)
-    assert fit_outline(flat, model, path(model, 0), renderer, (160, 120)) is None
+    assert fit_outline(flat, model, path(model, 0), renderer, (160, 120), 0.1) is None
 
 
 def test_an_outline_is_not_sought_where_the_object_is_hidden(model: ObjectModel, renderer: Renderer) -> None:

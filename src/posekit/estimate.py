@@ -209,7 +209,8 @@ class PoseEstimator:
         """Each with its outline where the photograph's colours change; as it is where these do not tell."""
         if not self.options.outline:
             return list(refined)
-        poses = [fit_outline(view, self.model, r.T_cam_obj, self.renderer, self.predictor.size) for r in refined]
+        size = self.predictor.size
+        poses = [fit_outline(view, self.model, r.T_cam_obj, self.renderer, size, r.angle) for r in refined]
         return [r if pose is None else replace(r, T_cam_obj=pose) for r, pose in zip(refined, poses, strict=True)]
 
     def _presence(self, view: View, T_cam_obj: Pose) -> float:

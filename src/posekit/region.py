@@ -39,7 +39,8 @@ HUE = 0.12  # distance of chromaticities beyond which a pixel is not the mesh's
 SUDDEN, SMOOTH = 0.12, 1.0  # the same beyond what it has been before; pixels over which that is averaged
 HIDDEN, BESIDE = 2, 5  # pixels: how deep a hidden part is that no pose's error explains, and how far it spoils outlines
 STEPS, LEAST_SEEN = 4, 0.15  # of a fit; share of the silhouette with the mesh's hues below which they say nothing
-LOOSE = (30.0, 8.0, 0.1)  # standard deviations of the pose that a fit starts from: degrees, pixels, share of distance
+# of the pose that a fit starts from, for each radian that it is unsure: radians, pixels, shares of the distance
+SURE, TURN, SHIFT, DEPTH = 0.02, 1.0, 30.0, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,20 +154,20 @@ def fit_outline(
     T_cam_obj: Pose,
     renderer: Renderer,
     size: tuple[int, int],
+    turn_std: float,
     steps: int = STEPS,
-    seen: Mask | None = None,
 ) -> Pose | None:
     """The ``T_cam_obj`` whose outline lies where the photograph's colours change from the object's to its ground's.
 
-    Colours are learned from the pose's own silhouette, again at every step. seen: (H, W) of the photograph, what shows
-    the object; None = what has the mesh's hues. size: (width, height) of the crops. None where too little of the
-    outline can be told.
+    Colours are learned from the pose's own silhouette, again at every step, where view.mask, or else the mesh's hues,
+    say that the object is seen. turn_std: how sure the given pose is, radians. size: (width, height) of the crops.
+    None where too little of the outline can be told.
     """
     outline, pose, colours = model.outline - model.center, T_cam_obj, None
     prior: Belief | None = None
     for _ in range(steps):
         zoom = zoom_to_pose(view.camera, pose @ model.T_obj_ctr, outline, size)
-        shown = view.with_mask(seen).zoomed(zoom)
+        shown = view.zoomed(zoom)
         [drawn] = renderer.render(model, [Pose.rotation(zoom.R_view_cam) @ pose], [zoom.camera])
         assert drawn.mask is not None
         visible = like_mesh(shown, drawn) if shown.mask is None else shown.mask
@@ -179,8 +180,9 @@ def fit_outline(
             return None
         T_view_ctr = Pose.rotation(zoom.R_view_cam) @ pose @ model.T_obj_ctr
         if prior is None:
-            turn, shift, depth = LOOSE
-            prior = Belief.about(T_view_ctr, zoom.camera, np.deg2rad(turn), shift, depth).turned(zoom.R_view_cam.T)
+            spread = max(turn_std, SURE)
+            prior = Belief.about(T_view_ctr, zoom.camera, TURN * spread, SHIFT * spread, DEPTH * spread)
+            prior = prior.turned(zoom.R_view_cam.T)
         found = fuse(T_view_ctr, [prior.turned(zoom.R_view_cam), lines], zoom.camera)
         if found is None or found.pose.t[2] < 0.6 * model.diameter:
             return None
