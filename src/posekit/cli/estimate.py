@@ -22,6 +22,7 @@ from posekit.cli.options import (
     MaskFromOption,
     MaskOption,
     ModelsOption,
+    OutlineOption,
     OutOption,
     PresetOption,
     SeedOption,
@@ -76,6 +77,7 @@ def estimate(
     iterations: IterationsOption = 50,
     stop_angle: StopAngleOption = 2.0,
     contour: ContourOption = True,
+    outline: OutlineOption = True,
     seed: SeedOption = 0,
     threads: ThreadsOption = None,
     out: OutOption = None,
@@ -93,7 +95,9 @@ def estimate(
     from posekit.object_model import ObjectModel
     from posekit.search import SearchOptions, estimate_instances
 
-    options = EstimateOptions(init, hypotheses, update, stop, iterations, stop_angle, seed, contour=contour)
+    options = EstimateOptions(
+        init, hypotheses, update, stop, iterations, stop_angle, seed, contour=contour, outline=outline
+    )
     view = load_view(image, camera)
     meshes = [ObjectModel.load(path, units=units, symmetry=symmetry) for path in model]
     finder = prompt_for(box, mask, mask_from, detections, image)

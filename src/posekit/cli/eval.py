@@ -16,6 +16,7 @@ from posekit.cli.options import (
     BesideOption,
     ContourOption,
     IterationsOption,
+    OutlineOption,
     PresetOption,
     SeedOption,
     StopAngleOption,
@@ -89,6 +90,7 @@ def evaluate(
     stop_angle: StopAngleOption = 2.0,
     beside: BesideOption = True,
     contour: ContourOption = True,
+    outline: OutlineOption = True,
     seed: SeedOption = 0,
     threads: Annotated[int, typer.Option(min=1, help="Of torch, in each worker.", rich_help_panel=LOOP)] = 1,
     workers: Annotated[int, typer.Option(min=1, help="Processes.", rich_help_panel=LOOP)] = 1,
@@ -135,7 +137,9 @@ def evaluate(
         noise=_noise(noise),
         preset=preset,
         weights=weights,
-        estimate=EstimateOptions(init, hypotheses, update, stop, iterations, stop_angle, seed, beside, contour),
+        estimate=EstimateOptions(
+            init, hypotheses, update, stop, iterations, stop_angle, seed, beside, contour, outline
+        ),
         threads=threads,
         workers=workers,
     )

@@ -95,6 +95,14 @@ ContourOption = Annotated[
         rich_help_panel=LOOP,
     ),
 ]
+OutlineOption = Annotated[
+    bool,
+    typer.Option(
+        "--outline/--no-outline",
+        help="Lay poses onto the outline that the photograph's colours show, where no exact mask decides.",
+        rich_help_panel=LOOP,
+    ),
+]
 SeedOption = Annotated[int, typer.Option(help="The same seed gives the same result.", rich_help_panel=LOOP)]
 ThreadsOption = Annotated[
     int | None, typer.Option(min=1, help="Threads of torch; by default its own choice.", rich_help_panel=LOOP)

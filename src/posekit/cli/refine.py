@@ -20,6 +20,7 @@ from posekit.cli.options import (
     MaskFromOption,
     MaskOption,
     ModelOption,
+    OutlineOption,
     OutOption,
     PresetOption,
     SeedOption,
@@ -56,6 +57,7 @@ def refine(
     stop_angle: StopAngleOption = 2.0,
     beside: BesideOption = True,
     contour: ContourOption = True,
+    outline: OutlineOption = True,
     seed: SeedOption = 0,
     threads: ThreadsOption = None,
     out: OutOption = None,
@@ -80,6 +82,7 @@ def refine(
         seed=seed,
         beside=beside,
         contour=contour,
+        outline=outline,
     )
     start = load_pose(pose)
     view = load_view(image, camera)
