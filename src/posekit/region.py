@@ -38,7 +38,7 @@ BLUR = 1.0  # pixels over which neighbours decide together whose they are
 HUE = 0.12  # distance of chromaticities beyond which a pixel is not the mesh's
 SUDDEN, SMOOTH = 0.12, 1.0  # the same beyond what it has been before; pixels over which that is averaged
 HIDDEN, BESIDE = 2, 5  # pixels: how deep a hidden part is that no pose's error explains, and how far it spoils outlines
-STEPS, LEAST_SEEN = 4, 0.15  # of a fit; share of the silhouette with the mesh's hues below which they say nothing
+STEPS, LEAST_SEEN = 2, 0.15  # of a fit; share of the silhouette with the mesh's hues below which they say nothing
 # of the pose that a fit starts from, for each radian that it is unsure: radians, pixels, shares of the distance
 SURE, TURN, SHIFT, DEPTH = 0.02, 1.0, 30.0, 0.5
 
