@@ -372,11 +372,30 @@ def test_looks_in_two_sizes_are_joined(untrained: TrainedDetector, monkeypatch: 
     )
     monkeypatch.setattr(maskrcnn, "find", lambda *_, **__: next(looks))
     image = np.zeros((60, 80, 3), np.uint8)
-    found = maskrcnn.find_in_sizes(untrained, image, (1.0, 2.0), least=0.15)
+    found = maskrcnn.find_in_looks(untrained, image, ((1.0, False), (2.0, False)), least=0.15)
     assert found.scores.tolist() == pytest.approx([0.6, 0.2]) and found.labels.tolist() == [0, 0]
     np.testing.assert_allclose(found.boxes, [[4.5, 4, 20.5, 20], [40, 30, 60, 50]], atol=1e-4)
     looks = iter([Found(np.zeros((0, 4)), np.zeros(0, np.int64), np.zeros(0), masks[:0])] * 2)
-    assert not len(maskrcnn.find_in_sizes(untrained, image, (1.0, 2.0), least=0.15).scores)
+    assert not len(maskrcnn.find_in_looks(untrained, image, ((1.0, False), (2.0, False)), least=0.15).scores)
+
+
+def test_a_mirrored_look_is_mirrored_back(untrained: TrainedDetector, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What stands for the network finds the picture's bright part."""
+
+    def bright(_: object, image: np.ndarray, **__: object) -> Found:
+        mask = image[..., 0] > 100
+        rows, columns = np.nonzero(mask)
+        box = [[columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]]
+        return Found(np.array(box, float), np.zeros(1, np.int64), np.array([0.8]), mask[None])
+
+    monkeypatch.setattr(maskrcnn, "find", bright)
+    image = np.zeros((60, 80, 3), np.uint8)
+    image[10:30, 5:25] = 200
+    for looks in (((1.0, True),), ((1.0, False), (1.5, True))):
+        found = maskrcnn.find_in_looks(untrained, image, looks, least=0.5)
+        np.testing.assert_allclose(found.boxes, [[5, 10, 25, 30]], atol=1e-4)
+        np.testing.assert_array_equal(found.masks[0], image[..., 0] > 100)
+        assert found.scores.tolist() == pytest.approx([0.8]), "one instance, seen by every look"
 
 
 # --- commands -----------------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,11 @@ from posekit.view import View
 KIND = SOURCE = "mask-rcnn"
 NOVEL = ("object",)  # the one class of a class-agnostic detector
 SHIPPED = Path(__file__).resolve().parent.parent / "weights" / "detector-novel"
-SCALES = {"lite0": (1.0, 4 / 3), "resnet50": (1.0,)}  # of the picture's size, one look each
+Look = tuple[float, bool]  # at the picture: its size over the configuration's ``use_size``, and whether it is mirrored
+LOOKS: dict[str, tuple[Look, ...]] = {
+    "lite0": ((1.0, False), (4 / 3, False), (1.0, True), (4 / 3, True)),
+    "resnet50": ((1.0, False),),
+}
 DOUBTFUL = 0.05  # score of a look's detections that may be joined with another look's
 SAME = 0.5  # intersection over union from which two looks' boxes are of one instance
 COCO = "coco"
@@ -239,23 +243,18 @@ def find(
     )
 
 
-def find_in_sizes(
-    detector: TrainedDetector, image: NDArray[np.uint8], scales: Sequence[float], *, least: float, most: int = 50
+def find_in_looks(
+    detector: TrainedDetector, image: NDArray[np.uint8], looks: Sequence[Look], *, least: float, most: int = 50
 ) -> Found:
-    """Look at a picture in several sizes, and join what overlaps by half and has the same label: the mean of the scores
+    """Look at a picture several times, and join what overlaps by half and has the same label: the mean of the scores
     (0 from a look that does not see it), the boxes' mean weighted by score, the surest look's mask.
 
-    scales: of the configuration's ``use_size``. least: of the joined score. most: detections of a look. Raises
-    ValueError without scales.
+    least: of the joined score. most: detections of a look. Raises ValueError without looks.
     """
-    width, height = detector.config.use_size
-    looks = [
-        find(detector, image, least=min(least, DOUBTFUL), most=most, size=(round(scale * width), round(scale * height)))
-        for scale in scales
-    ]
-    which = np.repeat(np.arange(len(looks)), [len(look.scores) for look in looks])
+    seen = [_look(detector, image, look, min(least, DOUBTFUL), most) for look in looks]
+    which = np.repeat(np.arange(len(seen)), [len(found.scores) for found in seen])
     boxes, labels, scores, masks = (
-        np.concatenate([getattr(look, name) for look in looks]) for name in ("boxes", "labels", "scores", "masks")
+        np.concatenate([getattr(found, name) for found in seen]) for name in ("boxes", "labels", "scores", "masks")
     )
     overlaps = torchvision().ops.box_iou(torch.from_numpy(boxes), torch.from_numpy(boxes)).numpy()
     order, groups = np.argsort(-scores, kind="stable"), []
@@ -275,13 +274,24 @@ def find_in_sizes(
     )
 
 
+def _look(detector: TrainedDetector, image: NDArray[np.uint8], look: Look, least: float, most: int) -> Found:
+    scale, mirrored = look
+    size = round(scale * detector.config.use_size[0]), round(scale * detector.config.use_size[1])
+    if not mirrored:
+        return find(detector, image, least=least, most=most, size=size)
+    found = find(detector, np.ascontiguousarray(image[:, ::-1]), least=least, most=most, size=size)
+    boxes = found.boxes.copy()
+    boxes[:, [0, 2]] = image.shape[1] - boxes[:, [2, 0]]
+    return replace(found, boxes=boxes, masks=found.masks[:, :, ::-1])
+
+
 def _mean_of_looks(scores: NDArray[np.float64], which: NDArray[np.int64], looks: int) -> float:
     return sum(float(scores[which == look].max(initial=0.0)) for look in range(looks)) / looks
 
 
 class MaskRCNN:
     """A Detector that was trained for its classes; a model is found by its name. least: score of a detection. most: of
-    one class, 0 = all. It looks at the picture in the sizes that `SCALES` has for its backbone."""
+    one class, 0 = all. It looks at the picture as often as `LOOKS` says for its backbone."""
 
     def __init__(self, detector: TrainedDetector, least: float = 0.5, most: int = 0) -> None:
         self.detector, self.least, self.most = detector, least, most
@@ -296,7 +306,7 @@ class MaskRCNN:
                 f"this detector does not know {', '.join(unknown)}; it was trained for {', '.join(classes)}. Use "
                 "--detector novel, or train one with posekit train detector."
             )
-        found = find_in_sizes(self.detector, view.image, SCALES[self.detector.config.backbone], least=self.least)
+        found = find_in_looks(self.detector, view.image, LOOKS[self.detector.config.backbone], least=self.least)
         left = dict.fromkeys([m.name for m in models] or classes, self.most or len(found.labels))
         detections = []
         for box, label, score, mask in zip(found.boxes, found.labels, found.scores, found.masks, strict=True):
