@@ -12,7 +12,7 @@ import torch
 from typer.testing import CliRunner
 
 from objects import bracket
-from posekit.camera import Camera
+from posekit.camera import Camera, mask_box
 from posekit.cli.app import app
 from posekit.data.tabletop import TabletopConfig, procedural_objects
 from posekit.data.tabletop_stream import TabletopStream, TabletopStreamConfig, labelled_scenes
@@ -34,8 +34,8 @@ from posekit.detect.segmentation import decode, encode
 from posekit.detect.vision import nms, roi_align, torchvision
 from posekit.draw import png
 from posekit.errors import ConfigError, PromptError, WeightsError
-from posekit.geometry import Pose, random_rotation
-from posekit.novel import NovelDetector
+from posekit.geometry import Pose, random_rotation, view_rotation
+from posekit.novel import LikenedDetector, NovelDetector
 from posekit.object_model import ObjectModel
 from posekit.render import Renderer
 from posekit.results import Detection, Estimate
@@ -377,6 +377,34 @@ def test_looks_in_two_sizes_are_joined(untrained: TrainedDetector, monkeypatch: 
     np.testing.assert_allclose(found.boxes, [[4.5, 4, 20.5, 20], [40, 30, 60, 50]], atol=1e-4)
     looks = iter([Found(np.zeros((0, 4)), np.zeros(0, np.int64), np.zeros(0), masks[:0])] * 2)
     assert not len(maskrcnn.find_in_looks(untrained, image, ((1.0, False), (2.0, False)), least=0.15).scores)
+
+
+def test_what_looks_like_the_mesh_counts_for_more(renderer: Renderer) -> None:
+    """Two detections of the same score: the bracket itself, and a grey patch."""
+    camera, model = Camera.from_fov(0.9, 160, 120), bracket()
+    pose = Pose(view_rotation([0.5, -1.0, 0.6]), [-0.06, 0.0, 0.5]) @ model.T_obj_ctr.inverse()
+    [drawn] = renderer.render(model, [pose], [camera])
+    assert drawn.mask is not None
+    image = np.where(drawn.mask[..., None], drawn.image, 128).astype(np.uint8)
+    patch = np.zeros((120, 160), bool)
+    patch[30:70, 110:150] = True
+    boxes = (mask_box(drawn.mask), (110.0, 30.0, 150.0, 70.0))
+    masks = (drawn.mask, patch)
+
+    class Trained:
+        def detect(self, _: View, __: list) -> list[Detection]:
+            return [Detection(b, m, 0.4, "bracket", "mask-rcnn") for b, m in zip(boxes, masks, strict=True)]
+
+    view = View(image, camera)
+    finder = LikenedDetector(Trained(), renderer, 0.5)  # type: ignore[arg-type]
+    [found] = finder.detect(view, [model])
+    assert found.box == boxes[0] and found.score > 0.8 and found.source == "mask-rcnn"
+    finder = LikenedDetector(Trained(), renderer, 0.0)  # type: ignore[arg-type]
+    assert finder.detect(view, [model])[1].score < 0.3
+    plain = dataclasses.replace(model, colors=None)
+    assert [d.score for d in finder.detect(view, [plain])] == [0.4, 0.4], "nothing to compare colours with"
+    finder = LikenedDetector(Trained(), renderer, 0.0, most=1)  # type: ignore[arg-type]
+    assert [d.box for d in finder.detect(view, [model])] == [boxes[0]]
 
 
 def test_a_mirrored_look_is_mirrored_back(untrained: TrainedDetector, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,8 +8,9 @@ docs/decisions tells what each is worth.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from weakref import WeakKeyDictionary
 
@@ -40,6 +41,7 @@ ANY = "novel"  # the name of the shipped detector
 SIDE = 96  # pixels of the pictures whose features are compared
 LEVELS = {"2": 16, "3": 32}  # of the features, and their strides
 MARGIN = 1.1
+WEIGHT, USUAL = 20.0, 0.56  # of an object's likeness, and the one that says nothing: docs/decisions/0015
 
 
 @dataclass(frozen=True)
@@ -78,56 +80,21 @@ class _Looks:
     chroma: FArray
 
 
-class NovelDetector:
-    """A Detector for meshes that it has never seen. What it keeps of a mesh is made at its first use.
+class Likeness:
+    """How much detections look like a mesh. What it keeps of a mesh is made at its first use.
 
-    Raises ConfigError where the network is not class-agnostic, WeightsError where ImageNet's weights are missing.
+    Raises WeightsError where ImageNet's weights are missing.
     """
 
-    def __init__(self, detector: TrainedDetector, renderer: Renderer, options: NovelOptions = NovelOptions()) -> None:
-        if not detector.config.novel:
-            raise ConfigError(
-                f"this detector was trained for {', '.join(detector.config.classes)}, not for any object: pass "
-                "class-agnostic weights, or use it for its own classes."
-            )
-        self.detector, self.renderer, self.options = detector, renderer, options
+    def __init__(self, renderer: Renderer, options: NovelOptions) -> None:
+        self.renderer, self.options = renderer, options
         self._body = Lite0()
         load_lite0(self._body, lite0_imagenet())
         self._known: WeakKeyDictionary[ObjectModel, tuple[TemplateSearch, _Looks]] = WeakKeyDictionary()
 
-    def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
-        """The instances of the models, each model's best first; with no models, whatever looks like an object."""
-        proposals = self.propose(view)
-        if not models or not proposals:
-            return proposals
-        looks = self._looks(view, proposals)
-        found = [each for model in models for each in self._instances(view, model, proposals, looks)]
-        return [sharpened(view.image, each) for each in found]
-
-    def propose(self, view: View) -> list[Detection]:
-        """Objects of any kind, by falling score."""
-        options = self.options
-        width, height = self.detector.config.use_size
-        sizes = [(round(scale * width), round(scale * height)) for scale in options.scales]
-        looks = [find(self.detector, view.image, least=options.least_proposal, most=options.proposals, size=size)
-                 for size in sizes]  # fmt: skip
-        boxes = np.concatenate([look.boxes for look in looks])
-        scores = np.concatenate([look.scores for look in looks])
-        masks = np.concatenate([look.masks for look in looks])
-        kept = torchvision().ops.nms(torch.from_numpy(boxes), torch.from_numpy(scores), options.same).numpy()
-        return [
-            Detection((float(x0), float(y0), float(x1), float(y1)), mask, float(score), None, "novel")
-            for (x0, y0, x1, y1), mask, score in zip(boxes[kept], masks[kept], scores[kept], strict=True)
-        ]
-
-    def similarities(self, view: View, model: ObjectModel, proposals: Sequence[Detection]) -> list[float]:
-        """How much each proposal looks like the mesh, in [0, 1]."""
-        return self._similarities(view, model, proposals, self._looks(view, proposals)) if proposals else []
-
-    def _similarities(
-        self, view: View, model: ObjectModel, proposals: Sequence[Detection], looks: _Looks
-    ) -> list[float]:
-        """In two rounds: what neither its features nor its chroma speaks for gets no template search, and 0."""
+    def of(self, view: View, model: ObjectModel, proposals: Sequence[Detection], looks: _Looks) -> list[float]:
+        """Of each proposal, in [0, 1], in two rounds: what neither its features nor its chroma speaks for gets no
+        template search, and 0."""
         search, known = self._of(model)
         options = self.options
         alike = np.maximum(0.0, (looks.features @ known.features.T).max(axis=1) / len(LEVELS)).astype(np.float64)
@@ -142,19 +109,6 @@ class NovelDetector:
             scores[k] = min(1.0, (shape + options.features * alike[k]) / (1 + options.features)) * faded[k]
         return [float(score) for score in scores]
 
-    def _instances(
-        self, view: View, model: ObjectModel, proposals: Sequence[Detection], looks: _Looks
-    ) -> list[Detection]:
-        scores = self._similarities(view, model, proposals, looks)
-        kept: list[Detection] = []
-        for k in np.argsort(np.negative(scores), kind="stable"):
-            proposal, score = proposals[int(k)], scores[int(k)]
-            if score < self.options.least or len(kept) == self.options.most:
-                break
-            if all(_overlap(proposal, other) < self.options.overlap for other in kept):
-                kept.append(Detection(proposal.box, proposal.mask, score, model.name, "novel"))
-        return kept
-
     def _of(self, model: ObjectModel) -> tuple[TemplateSearch, _Looks]:
         if model not in self._known:
             pictures = self._pictures(model)
@@ -164,7 +118,7 @@ class NovelDetector:
             )
         return self._known[model]
 
-    def _looks(self, view: View, proposals: Sequence[Detection]) -> _Looks:
+    def looks(self, view: View, proposals: Sequence[Detection]) -> _Looks:
         crops = [self._crop(view, proposal) for proposal in proposals]
         return _Looks(self._features(crops), _chroma(crops))
 
@@ -192,6 +146,106 @@ class NovelDetector:
                 share = F.avg_pool2d(masks, stride)
                 pooled.append((levels[level] * share).sum((2, 3)) / (share.sum((2, 3)) + 1e-6))
         return np.asarray(torch.cat([F.normalize(p, dim=1) for p in pooled], 1).numpy(), np.float32)
+
+
+class NovelDetector:
+    """A Detector for meshes that it has never seen.
+
+    Raises ConfigError where the network is not class-agnostic, WeightsError where ImageNet's weights are missing.
+    """
+
+    def __init__(self, detector: TrainedDetector, renderer: Renderer, options: NovelOptions = NovelOptions()) -> None:
+        if not detector.config.novel:
+            raise ConfigError(
+                f"this detector was trained for {', '.join(detector.config.classes)}, not for any object: pass "
+                "class-agnostic weights, or use it for its own classes."
+            )
+        self.detector, self.renderer, self.options = detector, renderer, options
+        self.likeness = Likeness(renderer, options)
+
+    def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
+        """The instances of the models, each model's best first; with no models, whatever looks like an object."""
+        proposals = self.propose(view)
+        if not models or not proposals:
+            return proposals
+        looks = self.likeness.looks(view, proposals)
+        found = [each for model in models for each in self._instances(view, model, proposals, looks)]
+        return [sharpened(view.image, each) for each in found]
+
+    def propose(self, view: View) -> list[Detection]:
+        """Objects of any kind, by falling score."""
+        options = self.options
+        width, height = self.detector.config.use_size
+        sizes = [(round(scale * width), round(scale * height)) for scale in options.scales]
+        looks = [find(self.detector, view.image, least=options.least_proposal, most=options.proposals, size=size)
+                 for size in sizes]  # fmt: skip
+        boxes = np.concatenate([look.boxes for look in looks])
+        scores = np.concatenate([look.scores for look in looks])
+        masks = np.concatenate([look.masks for look in looks])
+        kept = torchvision().ops.nms(torch.from_numpy(boxes), torch.from_numpy(scores), options.same).numpy()
+        return [
+            Detection((float(x0), float(y0), float(x1), float(y1)), mask, float(score), None, "novel")
+            for (x0, y0, x1, y1), mask, score in zip(boxes[kept], masks[kept], scores[kept], strict=True)
+        ]
+
+    def similarities(self, view: View, model: ObjectModel, proposals: Sequence[Detection]) -> list[float]:
+        """How much each proposal looks like the mesh, in [0, 1]."""
+        return self.likeness.of(view, model, proposals, self.likeness.looks(view, proposals)) if proposals else []
+
+    def _instances(
+        self, view: View, model: ObjectModel, proposals: Sequence[Detection], looks: _Looks
+    ) -> list[Detection]:
+        scores = self.likeness.of(view, model, proposals, looks)
+        kept: list[Detection] = []
+        for k in np.argsort(np.negative(scores), kind="stable"):
+            proposal, score = proposals[int(k)], scores[int(k)]
+            if score < self.options.least or len(kept) == self.options.most:
+                break
+            if all(_overlap(proposal, other) < self.options.overlap for other in kept):
+                kept.append(Detection(proposal.box, proposal.mask, score, model.name, "novel"))
+        return kept
+
+
+class LikenedDetector:
+    """A detector that was trained for its meshes, whose detections' scores also say how much they look like them: the
+    log odds grow by `WEIGHT` times what the likeness is above `USUAL`. Meshes without colours are left to the detector.
+
+    least: score of a detection. most: of one mesh, 0 = all.
+    """
+
+    def __init__(self, detector: MaskRCNN, renderer: Renderer, least: float, most: int = 0) -> None:
+        self.detector, self.least, self.most = detector, least, most
+        self.likeness = Likeness(renderer, NovelOptions(objectness=0.0))
+
+    def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
+        """Instances of the models, by falling score; with no models, of all classes by the detector's own scores.
+        Raises ConfigError where a model is no class."""
+        found = self.detector.detect(view, models)
+        for model in models:
+            mine = [k for k, each in enumerate(found) if each.label == model.name]
+            if not mine or (model.colors is None and model.texture is None):
+                continue
+            proposals = [found[k] for k in mine]
+            alike = self.likeness.of(view, model, proposals, self.likeness.looks(view, proposals))
+            for k, likeness in zip(mine, alike, strict=True):
+                found[k] = replace(found[k], score=likened(found[k].score, likeness))
+        left: dict[str | None, int] = {}
+        kept = []
+        for each in sorted(found, key=lambda d: -d.score):
+            left[each.label] = left.get(each.label, self.most or len(found)) - 1
+            if each.score >= self.least and left[each.label] >= 0:
+                kept.append(each)
+        return kept
+
+
+def likened(chance: float, likeness: float) -> float:
+    """A chance that also says how much a thing looks like the mesh: docs/decisions/0015."""
+    return shifted(chance, WEIGHT * (likeness - USUAL))
+
+
+def shifted(chance: float, shift: float) -> float:
+    """A chance whose log odds are shifted; 0 and 1 stay."""
+    return chance if not 0 < chance < 1 else 1 / (1 + (1 / chance - 1) * math.exp(-shift))
 
 
 def _chroma(pictures: Sequence[View]) -> FArray:
@@ -230,7 +284,12 @@ def make_detector(
     if not trained.config.novel:
         names = tuple(m.name for m in models) or trained.config.classes
         usual = DOUBTFUL if doubtful else 0.5
-        return MaskRCNN(trained, usual if least is None else least, most if doubtful else 0), names
+        least = usual if least is None else least
+        if name == COCO:
+            return MaskRCNN(trained, least, most if doubtful else 0), names
+        return LikenedDetector(
+            MaskRCNN(trained, min(least, DOUBTFUL)), Renderer(), least, most if doubtful else 0
+        ), names
 
     options = NovelOptions(most=most) if least is None else NovelOptions(least=least, least_proposal=least, most=most)
     if models and least is not None:

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from posekit.camera import Box
 from posekit.errors import ConfigError
 from posekit.estimate import PoseEstimator
-from posekit.novel import ANY
+from posekit.novel import ANY, USUAL, WEIGHT, shifted
 from posekit.results import Detection, Estimate
 from posekit.view import View
-
-WEIGHT, USUAL = 20.0, 0.56  # of a novel object's likeness, and the one that says nothing: docs/decisions/0015
 
 
 @dataclass(frozen=True)
@@ -51,14 +48,9 @@ def estimates_of(
     found = []
     for detection in detections:
         shift = WEIGHT * (detection.score - USUAL) if detection.source == ANY else 0.0
-        for estimate in estimator.estimate(view, [detection], _shifted(options.least, -shift)):
-            found.append(replace(estimate, score=_shifted(estimate.score, shift)))
+        for estimate in estimator.estimate(view, [detection], shifted(options.least, -shift)):
+            found.append(replace(estimate, score=shifted(estimate.score, shift)))
     return found
-
-
-def _shifted(chance: float, shift: float) -> float:
-    """A chance whose log odds are shifted; 0 and 1 stay."""
-    return chance if not 0 < chance < 1 else 1 / (1 + (1 / chance - 1) * math.exp(-shift))
 
 
 def instances_of(estimates: Sequence[Estimate], options: SearchOptions = SearchOptions()) -> list[Estimate]:
