@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,7 +11,8 @@ import pytest
 import torch
 
 from objects import bracket
-from posekit.data.augment import AugmentConfig, augment, disturb_mask
+from posekit.data.appearance import KINDS, faded, variants
+from posekit.data.augment import AugmentConfig, augment, composed, disturb_mask, observe
 from posekit.data.pairs import Pair, PairConfig, render_pairs, stack_statistics
 from posekit.data.procedural import random_object, random_texture
 from posekit.data.scenes import Frontal, SceneConfig, box_sample, render_scenes
@@ -23,14 +25,14 @@ from posekit.zoom import frontal_pose
 
 @pytest.fixture(scope="module")
 def pairs() -> list[Pair]:
-    return render_pairs(Renderer(), bracket(), 40, PairConfig(), np.random.default_rng(0))
+    return render_pairs(Renderer(), bracket(), 40, PairConfig(unlike=0, deformed=0), np.random.default_rng(0))
 
 
 def test_the_flow_leads_to_the_same_paint(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the flow says that a seen anchor goes, the target shows the colour that the source shows."""
     monkeypatch.setattr("posekit.data.pairs.random_light", lambda rng: Light(ambient=0.9, diffuse=0.1, specular=0.0))
     hues = []
-    for pair in render_pairs(Renderer(), bracket(), 30, PairConfig(), np.random.default_rng(0)):
+    for pair in render_pairs(Renderer(), bracket(), 30, PairConfig(unlike=0, deformed=0), np.random.default_rng(0)):
         if pair.lost:
             continue
         rows, columns = np.nonzero(pair.seen)
@@ -52,7 +54,7 @@ def test_pairs_are_what_their_numbers_say(pairs: list[Pair]) -> None:
         assert p.valid.any() and p.quat_wxyz[0] >= 0 and not (p.seen & ~p.valid).any()
         # the source's centre is the crop's: its silhouette reaches the middle's neighbourhood on both sides
         columns = np.flatnonzero((p.source[..., 3] > 0).any(0))
-        assert columns[0] < 80 < columns[-1]
+        assert columns[0] < 64 < columns[-1]
     quat, v = stack_statistics(pairs)
     assert len(quat) == len(v) == len(pairs) - len(lost)
 
@@ -62,18 +64,8 @@ def test_augmentation_keeps_the_truth(pairs: list[Pair]) -> None:
     for pair in pairs[:10]:
         sample = augment(pair, pairs, [], AugmentConfig(), rng)
         assert sample.pair is pair and sample.rendered is pair.source
-        assert sample.observed.shape == pair.target.shape and sample.observed.dtype == np.uint8
+        assert sample.observed.shape == pair.target.shape[:2] + (3,) and sample.observed.dtype == np.uint8
         assert not (sample.visible & ~pair.seen).any(), "nothing becomes visible"
-
-
-def test_a_mask_can_be_the_last_poses(pairs: list[Pair]) -> None:
-    plain = AugmentConfig(0, 0, 0, 1.0, dilate=1, no_mask=0, box_mask=0, cut_mask=0, source_mask=1.0)
-    overlaps = []
-    for k, pair in enumerate(pairs):
-        mask = augment(pair, [], [], plain, np.random.default_rng(k)).observed[..., 3] > 0
-        known = pair.source[..., 3] > 0
-        overlaps.append((mask & known).sum() / max(1, (mask | known).sum()))
-    assert np.median(overlaps) > 0.9
 
 
 def test_without_augmentation_the_object_stays_where_it_is(pairs: list[Pair]) -> None:
@@ -81,10 +73,52 @@ def test_without_augmentation_the_object_stays_where_it_is(pairs: list[Pair]) ->
     rng = np.random.default_rng(6)
     overlaps = []
     for pair in pairs[:10]:
-        mask = augment(pair, [], [], config, rng).observed[..., 3] > 0
+        mask = observe(pair.target, [], [], config, rng)[0][..., 3] > 0
         true = pair.target[..., 3] > 0
         overlaps.append((mask & true).sum() / (mask | true).sum())
     assert np.median(overlaps) > 0.9
+
+
+def test_silhouettes_are_the_targets_in_blocks(pairs: list[Pair]) -> None:
+    pair = pairs[0]
+    free = augment(pair, [], [], AugmentConfig(occluded=0), np.random.default_rng(0)).silhouettes
+    whole = pair.target[..., 3].reshape(24, 4, 32, 4).mean((1, 3))
+    np.testing.assert_allclose(free[1], whole, atol=1)
+    np.testing.assert_array_equal(free[0], free[1])
+    hidden = augment(pair, pairs, [], AugmentConfig(occluded=1), np.random.default_rng(1)).silhouettes
+    np.testing.assert_array_equal(hidden[1], free[1])
+    assert (hidden[0] <= hidden[1]).all() and (hidden[0] < hidden[1]).any()
+
+
+def test_edges_are_mixed_over_a_pixel_and_the_inside_kept() -> None:
+    target = np.zeros((96, 128, 4), np.uint8)
+    target[30:60, 40:90] = (200, 40, 40, 255)
+    plain = AugmentConfig(photo=0, clutter=0, camouflage=0, occluded=0, shrink=1, tone=0, harsh=0)
+    hard, soft = (composed(target, [], [], replace(plain, soft=s), np.random.default_rng(2))[0] for s in (0.0, 1.0))
+    assert hard.shape == (96, 128, 3)
+    change = np.abs(hard.astype(int) - soft).sum(2)
+    assert change[27:33, 60].max() > 10 and change[45, 60] <= change[27:33, 60].max()
+
+
+@pytest.mark.parametrize("kind", KINDS[:-1])
+def test_a_faded_mesh_has_the_shape_and_fewer_colours(kind: str) -> None:
+    rng = np.random.default_rng(0)
+    model = next(m for m in (random_object(rng) for _ in range(50)) if m.texture is not None)
+    found = faded(model, kind, rng)
+    np.testing.assert_array_equal(found.vertices, model.vertices)
+    assert found.texture is None and (found.colors is None) == (kind == "plain")
+
+
+def test_variants_look_unlike_and_stay_near_each_other() -> None:
+    rng = np.random.default_rng(1)
+    model = random_object(rng)
+    assert variants(model, [], 0.0, 0.0, rng) == (model, model)
+    unlike = [variants(model, [], 1.0, 0.0, rng) for _ in range(10)]
+    assert all(a is not b for a, b in unlike)
+    rendered, observed = variants(model, [], 0.0, 1.0, rng)
+    assert observed is model
+    moved = np.linalg.norm(rendered.vertices - model.vertices, axis=1).max() / model.diameter
+    assert 0.0005 < moved < 0.01
 
 
 @pytest.mark.parametrize(
@@ -130,11 +164,11 @@ def test_a_seed_gives_the_same_batches() -> None:
     first, again, other = (iter(PairStream(small(), seed)) for seed in (1, 1, 2))
     for _ in range(3):
         a, b, c = next(first), next(again), next(other)
-        dense = {"observed", "rendered", "flow", "relief", "valid", "visible"}
+        dense = {"observed", "rendered", "flow", "relief", "valid", "visible", "silhouettes"}
         assert set(a) == dense | {"focal", "quat_wxyz", "v", "angle", "lost"}
         assert all(torch.equal(a[k], b[k]) for k in a)
         assert not torch.equal(a["observed"], c["observed"])
-    assert a["observed"].shape == (4, 120, 160, 4) and a["flow"].shape == (4, 2, 30, 40)
+    assert a["observed"].shape == (4, 96, 128, 3) and a["flow"].shape == (4, 2, 24, 32)
 
 
 def test_the_users_meshes_are_what_is_drawn() -> None:
@@ -153,7 +187,7 @@ def test_photos_are_read_and_others_left(tmp_path: Path) -> None:
 
 
 def test_a_stream_goes_on_where_it_stopped() -> None:
-    config = small(mvnet=2, reuse=1)
+    config = small(reuse=1)
     whole = iter(PairStream(config, 1))
     batches = [next(whole) for _ in range(9)]
     later = iter(PairStream(config, 1, start=7))

@@ -15,14 +15,23 @@ from posekit.errors import WeightsError
 from posekit.nets.flownet import LAYERS, FlowNetEncoder
 from posekit.nets.heads import PoseHeads, Prediction, compress_angle, expand_angle
 from posekit.nets.inputs import images_to_tensor, relief, to_input
-from posekit.nets.lite import LiteConfig, LiteMVNet, LiteSVNet, attention, likeness_of, soft_flow, warp
-from posekit.nets.losses import Target, dense_loss, matching_loss, mvnet_loss, svnet_loss
+from posekit.nets.lite import (
+    LiteConfig,
+    LiteSVNet,
+    attention,
+    likeness_of,
+    normals_of,
+    soft_flow,
+    warp,
+    with_none,
+)
+from posekit.nets.losses import Target, dense_loss, matching_loss, mvnet_loss, svnet_loss, true_score
 from posekit.nets.paper import Branch, PaperMVNet, PaperSVNet
 from posekit.nets.rigid import Motion, Surface, exp_so3, induced_flow, solve_motion
 from posekit.nets.weights import PaperConfig, build, find_weights, load_networks, save_networks
 from posekit.view import View
 
-SMALL = LiteConfig(size=(64, 48), widths=(16, 32), blocks=2, fine=16)
+SMALL = LiteConfig(size=(64, 48), widths=(16, 32), blocks=2, bottleneck=16, fine=16)
 TINY_PAPER = PaperConfig(size=(128, 96), width=0.125)
 
 
@@ -36,8 +45,8 @@ def lite_pair(count: int, size: tuple[int, int] = SMALL.size) -> tuple[torch.Ten
     observed, rendered = pictures(count, size), pictures(count, size, 1)
     rendered[:, 3] = 0
     rendered[:, 3, 8:-8, 8:-8] = 1
-    bumps = 0.2 * torch.rand(count, size[1] // 4, size[0] // 4, generator=torch.Generator().manual_seed(2))
-    return observed, rendered, bumps, torch.full((count,), 6.0)
+    bumps = 0.2 * torch.rand(count, size[1], size[0], generator=torch.Generator().manual_seed(2))
+    return observed[:, :3], rendered, bumps, torch.full((count,), 6.0)
 
 
 def test_the_paper_preset_has_the_papers_layers() -> None:
@@ -109,29 +118,19 @@ def test_lite_answers_on_its_anchors() -> None:
     assert [f.shape for f in output.flows] == [(3, 2, 6, 8)] * 2
     assert [f.shape for f in output.rigid] == [(3, 2, 12, 16)] * 2
     assert output.compressed_angle.shape == (3,)
-    assert [x.shape for x in output.likenesses] == [(3, 48, 48)] * 2
+    assert [x.shape for x in output.likenesses] == [(3, 48, 49)] * 2
+    assert prediction.certainty is not None and prediction.certainty.shape == (3, 12, 16)
+    assert prediction.silhouettes is not None and prediction.silhouettes.shape == (3, 2, 12, 16)
+    assert prediction.score is not None and prediction.score.shape == (3,)
 
 
 def test_the_lite_preset_is_small_and_answers_in_one_batch_as_alone() -> None:
     net = LiteSVNet().eval()
     assert sum(p.numel() for p in net.parameters()) < 8e6
-    pair = lite_pair(2, (160, 120))
+    pair = lite_pair(2, LiteConfig().size)
     with torch.inference_mode():
         both, alone = net(*pair), net(*(x[1:] for x in pair))
     torch.testing.assert_close(both.flow[1:], alone.flow, atol=1e-3, rtol=1e-3)
-
-
-def test_lite_mvnet_keeps_the_views_features() -> None:
-    svnet = LiteSVNet(SMALL)
-    net = LiteMVNet(svnet.tower, SMALL).eval()
-    assert net.tower is svnet.tower, "the tower is shared"
-    observed, views = pictures(2, SMALL.size), pictures(6, SMALL.size, 1)
-    with torch.inference_mode():
-        whole = net(observed, views.expand(2, *views.shape))
-        kept = net.encode(views)
-        again = net.match(net.encode(observed), kept.expand(2, *kept.shape))
-    assert whole.quat_wxyz.shape == (2, 4) and whole.v.shape == (2, 3) and whole.angle is None
-    torch.testing.assert_close(whole.quat_wxyz, again.quat_wxyz)
 
 
 def test_weights_without_mvnet_load_without_it(tmp_path: Path) -> None:
@@ -144,10 +143,13 @@ def test_matching_finds_a_shifted_picture() -> None:
     generator = torch.Generator().manual_seed(0)
     rendered = torch.randn(1, 64, 12, 16, generator=generator)
     observed = torch.roll(rendered, shifts=(1, 2), dims=(2, 3))  # down 1, right 2
-    flow, peak = soft_flow(50 * likeness_of(rendered, observed), (12, 16))
+    none = torch.full((1, 192, 1), -10.0)
+    flow, found = soft_flow(with_none(50 * likeness_of(rendered, observed), none), (12, 16))
     inner = flow[0, :, :11, :14]  # what was not rolled over the side
     torch.testing.assert_close(inner, torch.tensor([16.0, 8.0]).view(2, 1, 1).expand_as(inner), atol=0.05, rtol=0)
-    assert float(peak.min()) > 0.9
+    assert float(found[:, 0].min()) > 0.9 and float(found[:, 1].max()) < 1e-3
+    _, found = soft_flow(with_none(50 * likeness_of(rendered, observed), none + 100), (12, 16))
+    assert float(found[:, 1].min()) > 0.99, "no cell is shown"
 
 
 def test_warping_by_the_flow_undoes_the_shift() -> None:
@@ -200,9 +202,22 @@ def test_relief_is_depth_about_its_mean_in_widths() -> None:
     depth = np.zeros((12, 16), np.float32)
     depth[2, 2], depth[2, 6] = 1.0, 1.2
     found = relief(View(np.zeros((12, 16, 3), np.uint8), camera, depth > 0, depth))
-    assert found.shape == (3, 4)
-    np.testing.assert_allclose(found[0, :2], [-0.1 / 1.1 * 5, 0.1 / 1.1 * 5], rtol=1e-5)
-    assert not found[1:].any()
+    assert found.shape == (12, 16)
+    np.testing.assert_allclose(found[2, [2, 6]], [-0.1 / 1.1 * 5, 0.1 / 1.1 * 5], rtol=1e-5)
+    assert np.count_nonzero(found) == 2
+
+
+def test_normals_are_those_of_a_plane_and_ignore_its_edges() -> None:
+    """depth = 1 + 0.1 (u - 31.5) / f: a slope of a tenth; relief is depth / mean - 1 in widths of the crop."""
+    focal, (h, w) = 4.0, (48, 64)
+    depth = (1 + 0.1 * (torch.arange(w) - 31.5) / (focal * w)).expand(1, h, w)
+    mask = torch.zeros(1, h, w)
+    mask[:, 10:30, 20:50] = 1
+    found = normals_of((depth - 1) * focal * mask, mask)
+    expected = torch.tensor([0.1, 0.0, -1.0]) / (1 + 0.1**2) ** 0.5
+    inside = found[0, :, 10:30, 20:50]
+    torch.testing.assert_close(inside, expected.view(3, 1, 1).expand_as(inside), atol=1e-4, rtol=0)
+    assert not found[:, :, :10].any() and not found[:, :, :, 50:].any()
 
 
 def test_inputs_agree() -> None:
@@ -255,22 +270,27 @@ def random_target(count: int, config: LiteConfig) -> Target:
     valid = torch.zeros(count, h, w, dtype=torch.bool)
     valid[:, 3:-3, 3:-3] = True
     return Target(shift.expand(count, 2, h, w).contiguous(), valid, valid.clone(), quat,
-                  torch.randn(count, 3, generator=generator), torch.rand(count, generator=generator), lost)  # fmt: skip
+                  torch.randn(count, 3, generator=generator), torch.rand(count, generator=generator), lost,
+                  torch.stack([valid, valid], dim=1).float())  # fmt: skip
 
 
 def test_the_matching_loss_is_least_where_the_truth_is() -> None:
     flow = torch.full((1, 2, 6, 8), 8.0)  # one cell right, one down
     shown = torch.ones(1, 6, 8, dtype=torch.bool)
-    right = torch.zeros(1, 48, 48)
+    right = torch.zeros(1, 48, 49)
+    right[0, :, -1] = 25.0  # what lies beside the crop is none
     for y in range(5):
         for x in range(7):
             right[0, y * 8 + x, (y + 1) * 8 + x + 1] = 50.0
-    assert float(matching_loss(right, flow, shown)) < 0.1
-    assert float(matching_loss(right, torch.zeros_like(flow), shown)) > 10
-    assert float(matching_loss(torch.zeros(1, 48, 48), flow, shown)) == pytest.approx(np.log(48), rel=1e-4)
+    assert float(matching_loss(right, flow, shown, shown)) < 0.1
+    assert float(matching_loss(right, torch.zeros_like(flow), shown, shown)) > 10
+    assert float(matching_loss(torch.zeros(1, 48, 49), flow, shown, shown)) == pytest.approx(np.log(49), rel=1e-4)
+    hidden = torch.zeros_like(shown)
+    assert float(matching_loss(right, flow, hidden, shown)) > 10, "hidden cells are none"
+    assert float(matching_loss(right, flow, hidden, hidden)) == 0
 
 
-def test_lost_pairs_teach_the_angle_alone() -> None:
+def test_lost_pairs_do_not_teach_the_pose() -> None:
     net = LiteSVNet(SMALL)
     target = random_target(2, SMALL)
     target.lost[:] = True
@@ -289,7 +309,7 @@ def test_one_batch_is_over_fitted() -> None:
     net.heads.set_statistics(target.quat_wxyz, target.v)
     pair = lite_pair(4)
     optimiser = torch.optim.AdamW(net.parameters(), lr=3e-3)
-    found: list[dict[str, float]] = []
+    found: list[dict[str, torch.Tensor]] = []
     for _ in range(150):
         loss, parts = dense_loss(net.predict(*pair), net.heads, target)
         optimiser.zero_grad()
@@ -299,6 +319,14 @@ def test_one_batch_is_over_fitted() -> None:
     assert found[-1]["epe_px"] < 0.25 * found[0]["epe_px"]
     assert found[-1]["rotation"] < 0.3 * found[0]["rotation"]
     assert found[-1]["angle"] < 0.3 * found[0]["angle"]
+    assert found[-1]["silhouettes"] < 0.3 * found[0]["silhouettes"]
+
+
+def test_the_true_score_falls_with_the_distance() -> None:
+    target = random_target(3, SMALL)
+    target.flow[:] = torch.tensor([0.0, 2.0, 200.0]).view(3, 1, 1, 1)
+    found = true_score(target, 2.0 * 2**0.5)
+    torch.testing.assert_close(found, torch.tensor([1.0, 0.36788, 0.0]), atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize(("preset", "config"), [("lite", SMALL), ("paper", TINY_PAPER)])
@@ -311,7 +339,7 @@ def test_weights_come_back_as_they_went(tmp_path: Path, preset: str, config: Lit
     for name, value in networks.svnet.state_dict().items():
         half = value.half().float() if value.is_floating_point() else value
         torch.testing.assert_close(loaded.svnet.state_dict()[name], half)
-    assert loaded.mvnet is not None
+    assert (loaded.mvnet is None) == (networks.mvnet is None)
     assert {p.name for p in tmp_path.iterdir()} == {"mine.safetensors", "mine.toml"}
     assert all(v.dtype != torch.float32 for v in load_file(tmp_path / "mine.safetensors").values())
 

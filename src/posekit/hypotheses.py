@@ -28,7 +28,6 @@ from posekit.geometry import (
     view_rotation,
 )
 from posekit.nets.inputs import to_input
-from posekit.nets.lite import LiteMVNet
 from posekit.nets.pose_delta import PoseDelta, apply_delta
 from posekit.nets.weights import Networks
 from posekit.object_model import ObjectModel
@@ -196,8 +195,6 @@ class MVNetSearch:
         poses = [Pose(R, np.array([0, 0, self.distance])) @ model.T_obj_ctr.inverse() for R in self.rotations]
         views = renderer.render(model, poses, self.camera, coords=False)
         self.views = torch.from_numpy(np.stack([to_input(v.image, v.mask) for v in views]))
-        with torch.inference_mode():
-            self.kept = self.mvnet.encode(self.views) if isinstance(self.mvnet, LiteMVNet) else None
 
     def search(self, view: View, detection: Detection, count: int) -> list[Hypothesis]:
         """One first pose; ``count`` is an upper bound, as for every search. Empty where it lies behind the camera."""
@@ -205,10 +202,7 @@ class MVNetSearch:
         crop = view.with_mask(mask).zoomed(zoom_to_box(view.camera, detection.box, self.size))
         observed = torch.from_numpy(to_input(crop.image, crop.mask))[None]
         with torch.inference_mode():
-            if isinstance(self.mvnet, LiteMVNet) and self.kept is not None:
-                out = self.mvnet.match(self.mvnet.encode(observed), self.kept[None])
-            else:
-                out = self.mvnet(observed, self.views[None])
+            out = self.mvnet(observed, self.views[None])
         delta = PoseDelta(quat_to_rotation(out.quat_wxyz[0].double().numpy()), out.v[0].double().numpy())
         target = apply_delta(self.frontal(crop.camera), delta, crop.camera.fx)
         if not np.isfinite(target.matrix).all() or target.t[2] < 0.6 * self.model.diameter:

@@ -44,7 +44,7 @@ def solve_pnp(
     """
     X, target = np.asarray(points, dtype=np.float64), np.asarray(pixels, dtype=np.float64)
     visible, sigma = np.asarray(weight, dtype=np.float64), np.asarray(scale_px, dtype=np.float64)
-    if (visible > 0.2).sum() < config.min_points:
+    if (visible > 0.1).sum() < config.min_points:
         return None
     R, t = start.R, start.t
     for _ in range(config.iterations):

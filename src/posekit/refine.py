@@ -141,7 +141,7 @@ def update_pose(
         found = prediction.correspondences
         assert found is not None and rendered.coords is not None
         points = rendered.coords[found.source[:, 1], found.source[:, 0]] - model.center
-        target = solve_pnp(points, found.target, found.visible, found.scale_px, rendered.camera, source)
+        target = solve_pnp(points, found.target, found.weight, found.scale_px, rendered.camera, source)
     if target is None or not np.isfinite(target.matrix).all() or target.t[2] < 0.6 * model.diameter:
         return None
     return T_view_cam.inverse() @ target @ model.T_obj_ctr.inverse()

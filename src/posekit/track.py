@@ -322,7 +322,7 @@ class Tracker:
             return []
         together = TOGETHER * (1 + (prediction.angle / DOUBTED) ** 2)
         scale = np.maximum(found.scale_px, LEAST_SCALE)
-        return [Points(points.astype(np.float64), found.target, found.visible, scale, KNEE, together)]
+        return [Points(points.astype(np.float64), found.target, found.weight, scale, KNEE, together)]
 
     def _estimate(
         self, view: View, pose: Pose, angle: float, iterations: int, score: float, timings: dict[str, float]

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from posekit.camera import Camera
+from posekit.data.appearance import variants
 from posekit.geometry import Pose, PoseNoise, random_rotation, rotation_angle, rotation_between, so3_exp, so3_log
 from posekit.nets.inputs import relief
 from posekit.nets.pose_delta import delta_between
@@ -29,17 +30,22 @@ class PairConfig:
     """How pairs are drawn. The noise is DeepIM's, scaled by the drawn magnitude and the object's diameter.
 
     size: (width, height) of the crop. distance: range of the distance in diameters. small, wide, lost: shares of
-    pairs with less noise than DeepIM's (late iterations), with more (bad first poses), and in another basin
-    altogether (only the angle head learns from them).
+    pairs with less noise than DeepIM's (late iterations), with more (bad first poses, up to ``widest`` times as much),
+    and in another basin altogether (only angle, score and silhouettes learn from them). flipped: of the lost ones,
+    those turned by about half a turn, whose outline is often right. unlike, deformed: see `appearance.variants`.
     """
 
-    size: tuple[int, int] = (160, 120)
+    size: tuple[int, int] = (128, 96)
     distance: tuple[float, float] = (3.0, 14.0)
     noise: PoseNoise = PoseNoise()
     small: float = 0.35
-    wide: float = 0.15
+    wide: float = 0.22
+    widest: float = 2.2
     lost: float = 0.12
+    flipped: float = 0.5
     enlarge: tuple[float, float] = (1.25, 1.6)
+    unlike: float = 0.35
+    deformed: float = 0.15
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +54,7 @@ class Pair:
 
     target, source: uint8 (H, W, 4), RGB and alpha = mask. flow: float32 (h, w, 2), crop pixels from the source's
     anchor to the target's place. valid: bool (h, w), the anchor lies on the source. seen: bool (h, w), the
-    anchor's surface point is not hidden by the object itself in the target. relief: float16 (h, w), the
+    anchor's surface point is not hidden by the object itself in the target. relief: float16 (H, W), the
     source's, see ``nets.inputs.relief``. focal: the crop's focal length in its widths. quat_wxyz: (4,). v: (3,).
     angle: radians. lost: True where the source is in another basin.
     """
@@ -76,21 +82,28 @@ def _draw_poses(diameter: float, config: PairConfig, rng: np.random.Generator) -
     if config.lost <= kind < config.lost + config.small:
         magnitude = float(np.exp(rng.uniform(np.log(0.04), 0.0)))
     elif config.lost + config.small <= kind < config.lost + config.small + config.wide:
-        magnitude = float(rng.uniform(1.0, 1.6))
+        magnitude = float(rng.uniform(1.0, config.widest))
     dR, dt = config.noise.sample(rng)
     w = so3_log(dR) * magnitude
     # DeepIM's centimetres are for objects of about 0.15 m at 0.9 m: keep their effect on the crop
     dt = dt * magnitude * np.array([diameter / 0.15, diameter / 0.15, distance / 0.9])
-    if lost:
-        while rotation_angle(dR := random_rotation(rng)) < np.deg2rad(25):
-            pass
-    else:
-        dR = so3_exp(w)
+    dR = _lost_turn(config, rng) if lost else so3_exp(w)
     t = target.t + dt
     t[2] = max(t[2], 1.2 * diameter)
     source = Pose(dR @ target.R, t)
     turn = Pose.rotation(rotation_between(source.t, [0.0, 0.0, 1.0]))
     return turn @ source, turn @ target, lost
+
+
+def _lost_turn(config: PairConfig, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Any turn above 25 degrees; or about half a turn about an axis in the picture or along the view."""
+    if rng.random() < config.flipped:
+        along = rng.uniform(0, 2 * np.pi)
+        axis = np.array([0.0, 0.0, 1.0] if rng.random() < 0.4 else [np.cos(along), np.sin(along), 0.0])
+        return so3_exp(np.pi * axis) @ so3_exp(rng.normal(size=3) * np.deg2rad(8.0))
+    while rotation_angle(dR := random_rotation(rng)) < np.deg2rad(25):
+        pass
+    return dR
 
 
 def random_light(rng: np.random.Generator) -> Light:
@@ -110,9 +123,15 @@ def random_light(rng: np.random.Generator) -> Light:
 
 
 def render_pairs(
-    renderer: Renderer, model: ObjectModel, count: int, config: PairConfig, rng: np.random.Generator
+    renderer: Renderer,
+    model: ObjectModel,
+    count: int,
+    config: PairConfig,
+    rng: np.random.Generator,
+    photos: Sequence[NDArray[np.uint8]] = (),
 ) -> list[Pair]:
-    """``count`` pairs of one object, drawn in two batches."""
+    """``count`` pairs of one object, drawn in two batches. photos: to cut other paint from."""
+    rendered, observed = variants(model, photos, config.unlike, config.deformed, rng)
     outline = model.outline - model.center
     T_ctr_obj = model.T_obj_ctr.inverse()
     sources, targets, cameras, lost = [], [], [], []
@@ -124,9 +143,9 @@ def render_pairs(
         targets.append(target)
         cameras.append(zoom.camera)
         lost.append(is_lost)
-    drawn_sources = renderer.render(model, [s @ T_ctr_obj for s in sources], cameras)
+    drawn_sources = renderer.render(rendered, [s @ T_ctr_obj for s in sources], cameras)
     lights = [random_light(rng) for _ in range(count)]
-    drawn_targets = renderer.render(model, [t @ T_ctr_obj for t in targets], cameras, light=lights)
+    drawn_targets = renderer.render(observed, [t @ T_ctr_obj for t in targets], cameras, light=lights)
     pairs = []
     for source, target, camera, is_lost, s, t in zip(
         sources, targets, cameras, lost, drawn_sources, drawn_targets, strict=True

@@ -24,12 +24,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
-from posekit.data.augment import AugmentConfig, Sample, augment, observe
+from posekit.data.augment import AugmentConfig, Sample, augment
 from posekit.data.pairs import Pair, PairConfig, render_pairs
 from posekit.data.procedural import random_object
-from posekit.data.scenes import BoxSample, Frontal, Scene, SceneConfig, box_sample, render_scenes
+from posekit.data.scenes import SceneConfig
 from posekit.errors import ConfigError
-from posekit.geometry import Pose
 from posekit.object_model import ObjectModel
 from posekit.render import Renderer
 
@@ -144,42 +143,24 @@ class _Shard:
 
     def __init__(self, stream: PairStream, lane: int, shard: int, renderer: Renderer) -> None:
         self.stream, self.config, self.shard, self.renderer = stream, stream.config, shard, renderer
-        self.for_pairs, self.for_scenes = Source(stream, lane, shard), Source(stream, lane, shard)
+        self.source = Source(stream, lane, shard)
         self.pairs = window(self._pairs, self.config, self.config.batch // self.config.shards)
-        self.scenes = window(self._scenes, self.config, self.config.mvnet // self.config.shards)
 
     def _pairs(self, block: int) -> list[Pair]:
-        model, rng = self.for_pairs.object(PAIRS, block), self.for_pairs.rng(PAIRS, block)
-        return render_pairs(self.renderer, model, self.config.per_object, self.config.pairs, rng)
+        model, rng = self.source.object(PAIRS, block), self.source.rng(PAIRS, block)
+        return render_pairs(self.renderer, model, self.config.per_object, self.config.pairs, rng, self.stream.photos)
 
-    def _scenes(self, block: int) -> tuple[Frontal, list[Scene]]:
-        model, rng = self.for_scenes.object(SCENES, block), self.for_scenes.rng(SCENES, block)
-        frontal = Frontal.of(model, self.renderer, self.config.scenes.crop)
-        return frontal, render_scenes(self.renderer, model, self.config.per_object, self.config.scenes, rng)
-
-    def draw(self, k: int, lanes: int) -> tuple[list[Sample], Frontal | None, list[BoxSample]]:
-        """This shard of batch k: pairs for SV-Net, and samples of one object for MV-Net."""
+    def draw(self, k: int, lanes: int) -> list[Sample]:
+        """This shard of batch k."""
         config, photos = self.config, self.stream.photos
         rng = np.random.default_rng([self.stream.seed, BATCHES, k, self.shard])
         pool = [pair for block in self.pairs.at(k // lanes) for pair in block]
         chosen = rng.integers(len(pool), size=config.batch // config.shards)
-        samples = [augment(pool[i], pool, photos, config.augment, rng) for i in chosen]
-        if not config.mvnet:
-            return samples, None, []
-        blocks = [block for block in self.scenes.at(k // lanes) if block[1]]
-        if not blocks:
-            raise ConfigError("none of the objects is seen in its own training scenes: are the meshes empty?")
-        frontal, scenes = blocks[int(rng.integers(len(blocks)))]
-        others = [scene.rgba for block in blocks for scene in block[1]]
-        boxed = []
-        for i in rng.integers(len(scenes), size=config.mvnet // config.shards):
-            picture, _ = observe(scenes[i].rgba, others, photos, config.augment, rng)
-            boxed.append(box_sample(picture, scenes[i], frontal, config.scenes, rng))
-        return samples, frontal, boxed
+        return [augment(pool[i], pool, photos, config.augment, rng) for i in chosen]
 
 
 class PairStream(IterableDataset[Batch]):
-    """Batches for the lite recipe, as dictionaries of tensors: `collate`'s, and with ``mvnet`` `collate_boxes`'.
+    """Batches for the lite recipe, as dictionaries of tensors: `collate`'s.
 
     models: the objects to train on; none = procedural ones. start: the first batch's number. rank: the process's
     number, which says which shards it draws.
@@ -195,11 +176,7 @@ class PairStream(IterableDataset[Batch]):
         renderer, count = Renderer(), self.config.shards
         shards = [_Shard(self, first % lanes, self.rank * count + i, renderer) for i in range(count)]
         for k in itertools.count(first, lanes):
-            drawn = [shard.draw(k, lanes) for shard in shards]
-            batch = collate([sample for samples, _, _ in drawn for sample in samples])
-            if self.config.mvnet:
-                batch |= collate_boxes([(frontal, boxed) for _, frontal, boxed in drawn if frontal is not None])
-            yield batch
+            yield collate([sample for shard in shards for sample in shard.draw(k, lanes)])
 
 
 def worker_lane(start: int) -> tuple[int, int]:
@@ -215,7 +192,8 @@ def worker_lane(start: int) -> tuple[int, int]:
 
 
 def collate(samples: Sequence[Sample]) -> Batch:
-    """observed, rendered: uint8 (B, H, W, 4); flow (B, 2, h, w); relief, valid, visible (B, h, w); others (B, ...)."""
+    """observed: uint8 (B, H, W, 3); rendered: uint8 (B, H, W, 4); flow (B, 2, h, w); relief (B, H, W); valid, visible
+    (B, h, w); silhouettes uint8 (B, 2, h, w); others (B, ...)."""
     pairs = [s.pair for s in samples]
 
     def stack(arrays: Sequence[NDArray]) -> Tensor:  # type: ignore[type-arg]
@@ -229,22 +207,9 @@ def collate(samples: Sequence[Sample]) -> Batch:
         "focal": torch.tensor([p.focal for p in pairs], dtype=torch.float32),
         "valid": stack([p.valid for p in pairs]),
         "visible": stack([s.visible for s in samples]),
+        "silhouettes": stack([s.silhouettes for s in samples]),
         "quat_wxyz": stack([p.quat_wxyz for p in pairs]),
         "v": stack([p.v for p in pairs]),
         "angle": torch.tensor([p.angle for p in pairs], dtype=torch.float32),
         "lost": torch.tensor([p.lost for p in pairs]),
-    }
-
-
-def collate_boxes(groups: Sequence[tuple[Frontal, Sequence[BoxSample]]]) -> Batch:
-    """MV-Net's samples by object: mv_observed uint8 (B, H, W, 4); mv_views uint8 (n, 6, H, W, 4), the n objects;
-    mv_object (B,), which of them; mv_quat_wxyz (B, 4), mv_v (B, 3)."""
-    boxed = [sample for _, samples in groups for sample in samples]
-    quat = np.stack([Pose.rotation(s.delta.R).quat_wxyz for s in boxed])
-    return {
-        "mv_observed": torch.from_numpy(np.stack([s.observed for s in boxed])),
-        "mv_views": torch.from_numpy(np.stack([frontal.views for frontal, _ in groups])),
-        "mv_object": torch.tensor([n for n, (_, samples) in enumerate(groups) for _ in samples]),
-        "mv_quat_wxyz": torch.from_numpy(quat.astype(np.float32)),
-        "mv_v": torch.from_numpy(np.stack([s.delta.v for s in boxed]).astype(np.float32)),
     }

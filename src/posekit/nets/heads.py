@@ -16,7 +16,10 @@ class Prediction:
     for MV-Net.
     Dense head (lite only), on a grid of h x w anchors, every 4th pixel from (2, 2) on:
     flow: (B, 2, h, w) crop pixels from the rendered to the observed place; log_scale: (B, h, w), the
-    logarithm of the flow's Laplace scale in pixels; visibility: (B, h, w), a logit.
+    logarithm of the flow's Laplace scale in pixels; visibility: (B, h, w), a logit; certainty: (B, h, w), a logit of
+    how much the anchor should count for the pose beside these, learned through the pose alone.
+    silhouettes: (B, 2, h, w), logits of the observed crop's 4x4 blocks: the object is visible there; it would be if
+    nothing stood before it. score: (B,), a logit: the pose is right.
     """
 
     quat_wxyz: Tensor
@@ -25,6 +28,9 @@ class Prediction:
     flow: Tensor | None = None
     log_scale: Tensor | None = None
     visibility: Tensor | None = None
+    certainty: Tensor | None = None
+    silhouettes: Tensor | None = None
+    score: Tensor | None = None
 
 
 ANGLE_KNEE = 0.0349066  # 2 degrees, the paper's threshold: below it the angle's scale is linear, above logarithmic

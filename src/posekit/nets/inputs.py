@@ -23,10 +23,10 @@ def to_input(image: NDArray[np.uint8], mask: NDArray[np.bool_] | None) -> NDArra
 
 
 def relief(rendered: View) -> NDArray[np.float32]:
-    """How much farther than the object's mean depth its surface lies at each anchor (every 4th pixel from (2, 2) on),
-    in widths of the crop, (h, w); zero beside the object. rendered: a view with depth."""
+    """How much farther than the object's mean depth its surface lies, in widths of the crop, (H, W); zero beside the
+    object. rendered: a view with depth."""
     assert rendered.depth is not None
-    depth = rendered.depth[2::4, 2::4]
+    depth = rendered.depth
     on = depth > 0
     if not on.any():
         return np.zeros_like(depth)
@@ -35,7 +35,7 @@ def relief(rendered: View) -> NDArray[np.float32]:
 
 
 def images_to_tensor(rgbm: Tensor) -> Tensor:
-    """uint8 (B, H, W, 4), alpha = mask (0 or 255) -> float32 (B, 4, H, W) as ``to_input`` gives it."""
+    """uint8 (B, H, W, 3 or 4), alpha = mask (0 or 255) -> float32 (B, 3 or 4, H, W) as ``to_input`` gives it."""
     x = rgbm.permute(0, 3, 1, 2).float().div(255.0)
-    offset = x.new_tensor([0.5, 0.5, 0.5, 0.0]).view(1, 4, 1, 1)
-    return (x - offset).contiguous(memory_format=torch.channels_last)
+    x[:, :3] -= 0.5
+    return x.contiguous(memory_format=torch.channels_last)

@@ -1,11 +1,13 @@
 """The preset that a laptop runs: a shared tower, exchange between both crops, matching, a dense head.
 
-A shared tower describes the observed and the rendered crop, another one the two laid over each other. Exchange blocks
-(convolutions within a crop, attention across the two) tell every cell of one what the other shows, and the rendered
-cells also know where their surface lies in space. Matching all pairs of cells gives a first flow (GMFlow's way: Xu et
-al., 2022) and that a rigid motion; where this motion says that both crops show the same, a head at 1/4 resolution
-compares them and gives the fine flow with its uncertainty and visibility. The paper's heads stand on the rendered
-cells.
+A shared tower describes the observed and the rendered crop, another one the two laid over each other, with the rendered
+mask, normals and relief. No mask of the observed object is an input: its visible and its whole silhouette are answers.
+Exchange blocks (bottleneck convolutions within a crop, attention across the two) tell every cell of one what the other
+shows. Matching all pairs of cells, with the further choice that a cell is not shown, gives a first flow (GMFlow's way:
+Xu et al., 2022) and that a rigid motion; where this motion says that both crops show the same, a head at 1/4
+resolution compares them and gives the fine flow with its confidence in three factors: visibility, precision and
+certainty (GenFlow: Moon et al., 2024). The paper's heads stand on the rendered cells, and beside them a score: whether
+the pose is right.
 """
 
 from __future__ import annotations
@@ -22,18 +24,21 @@ from posekit.nets.rigid import Motion, Surface, induced_flow, solve_motion
 CELL = 8  # pixels per cell
 ANCHOR = 4  # pixels per anchor of the dense head; the first anchor is pixel (2, 2)
 FACTS = 9  # see `facts_of`
+PAIR = 11  # channels that the tower over both crops sees: two RGB pictures, mask, normals, relief
 
 
 @dataclass(frozen=True)
 class LiteConfig:
     """size: (width, height) of the crop in pixels, multiples of 8. widths: channels at 1/4 and 1/8. heads: of the
-    attention across. blocks: exchanges. fine: channels of the dense head."""
+    attention across. blocks: exchanges. bottleneck: channels of their 3x3 convolutions. fine: channels of the dense
+    head."""
 
-    size: tuple[int, int] = (160, 120)
-    widths: tuple[int, int] = (96, 192)
+    size: tuple[int, int] = (128, 96)
+    widths: tuple[int, int] = (64, 192)
     heads: int = 1
-    blocks: int = 4
-    fine: int = 64
+    blocks: int = 6
+    bottleneck: int = 96
+    fine: int = 48
 
     @property
     def cells(self) -> tuple[int, int]:
@@ -73,17 +78,20 @@ class Tower(nn.Module):
 
 
 class Exchange(nn.Module):
-    """One exchange between two crops, the same weights both ways: 3x3 convolutions within, attention across."""
+    """One exchange between two crops, the same weights both ways: bottleneck convolutions within, attention across."""
 
-    def __init__(self, channels: int, heads: int) -> None:
+    def __init__(self, channels: int, heads: int, bottleneck: int) -> None:
         super().__init__()
         self.heads = heads
         self.within = nn.Sequential(
             nn.BatchNorm2d(channels),
-            nn.Conv2d(channels, channels, 3, 1, 1, bias=False),
-            nn.BatchNorm2d(channels),
+            nn.Conv2d(channels, bottleneck, 1, bias=False),
+            nn.BatchNorm2d(bottleneck),
             nn.ReLU(),
-            nn.Conv2d(channels, channels, 3, 1, 1),
+            nn.Conv2d(bottleneck, bottleneck, 3, 1, 1, bias=False),
+            nn.BatchNorm2d(bottleneck),
+            nn.ReLU(),
+            nn.Conv2d(bottleneck, channels, 1),
         )
         self.norm = nn.LayerNorm(channels)
         self.project = nn.Linear(channels, 3 * channels)
@@ -126,29 +134,48 @@ class Dense(nn.Module):
         self.know = nn.Conv2d(config.widths[1], width, 1)
         self.recall = nn.Conv2d(config.widths[0], width, 1)
         self.merge = nn.Sequential(conv_bn(4 * width + 2, 2 * width), nn.ReLU(), Residual(2 * width, 2 * width))
-        self.out = nn.Conv2d(2 * width, 16, 1)  # four are used; fewer channels than 16 are slow or worse on the CPU
+        self.out = nn.Conv2d(2 * width, 16, 1)  # five are used; fewer channels than 16 are slow or worse on the CPU
 
     def forward(self, observed: Tensor, rendered: Tensor, pair: Tensor, cells: Tensor, flow: Tensor) -> Tensor:
         """observed, rendered, pair: (B, C, h, w) at 1/4. cells: (B, C, h/2, w/2), rendered. flow: (B, 2, h, w), pixels.
-        -> (B, 4, h, w): change of flow, log scale, visibility."""
+        -> (B, 5, h, w): change of flow, log scale, visibility, certainty."""
         there = warp(self.look(observed), flow.detach() / ANCHOR)
         known = F.interpolate(self.know(cells), scale_factor=CELL / ANCHOR, mode="nearest")
         both = torch.cat(
             [self.look(rendered), there, self.recall(pair), known, (flow.detach() / 16).to(known.dtype)], dim=1
         )
-        return self.out(self.merge(both))[:, :4].float()
+        return self.out(self.merge(both))[:, :5].float()
+
+
+class Silhouettes(nn.Module):
+    """Where the observed crop shows the object, and where it would if nothing stood before it."""
+
+    def __init__(self, config: LiteConfig) -> None:
+        super().__init__()
+        width = config.fine
+        self.look = nn.Conv2d(config.widths[0], width, 1)
+        self.know = nn.Conv2d(config.widths[1], width, 1)
+        self.merge = nn.Sequential(conv_bn(2 * width, width), nn.ReLU(), nn.Conv2d(width, 16, 3, 1, 1))
+
+    def forward(self, fine: Tensor, cells: Tensor) -> Tensor:
+        """fine: (B, C, h, w) at 1/4 and cells: (B, C, h/2, w/2), observed -> (B, 2, h, w), logits: visible, whole."""
+        known = F.interpolate(self.know(cells), scale_factor=CELL / ANCHOR, mode="nearest")
+        return self.merge(torch.cat([self.look(fine), known], dim=1))[:, :2].float()
 
 
 def warp(x: Tensor, flow: Tensor) -> Tensor:
     """x (B, C, h, w) looked up at each place plus ``flow`` (B, 2, h, w), in x's own cells; zero outside."""
     h, w = x.shape[-2:]
-    place = (_grid(h, w, x) + flow).permute(0, 2, 3, 1)
-    grid = (2 * place + 1) / place.new_tensor([w, h]) - 1
-    return F.grid_sample(x, grid.to(x.dtype), align_corners=False, padding_mode="zeros")
+    column, row = (_grid(h, w, x) + flow).float().unbind(1)
+    grid = torch.stack([(2 * column + 1) / w - 1, (2 * row + 1) / h - 1], dim=3)
+    # bfloat16 has places to a quarter of a pixel only
+    return F.grid_sample(x.float(), grid, align_corners=False, padding_mode="zeros").to(x.dtype)
 
 
 def attention(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-    """Scaled dot-product attention, written out: trains faster on a CPU than torch's fused one, in bfloat16 too."""
+    """Scaled dot-product attention; written out on a CPU, where that trains faster than torch's fused one."""
+    if q.is_cuda:
+        return F.scaled_dot_product_attention(q, k.to(q.dtype), v.to(q.dtype))
     with torch.autocast(q.device.type, enabled=False):
         return torch.softmax((q * q.shape[-1] ** -0.5) @ k.transpose(2, 3), dim=3) @ v
 
@@ -163,8 +190,8 @@ def likeness_of(rendered: Tensor, observed: Tensor) -> Tensor:
 class LiteOutput:
     """All that the lite losses look at. flows: (B, 2, h, w) in pixels on cells, coarse to fine.
     rigid: (B, 2, h, w) in pixels on anchors, what the motions solved from the coarse and the fine flow induce.
-    compressed_angle: (B,). likenesses: (B, h * w, h * w), logits of which observed cell each rendered one is, before
-    and after the exchange."""
+    compressed_angle: (B,). likenesses: (B, h * w, h * w + 1), logits of which observed cell each rendered one is, the
+    last of them none, before and after the exchange."""
 
     prediction: Prediction
     flows: list[Tensor]
@@ -181,57 +208,77 @@ class LiteSVNet(nn.Module):
         self.config = config
         h, w = config.cells
         channels = config.widths[1]
-        self.tower = Tower(4, config.widths)
-        self.pair = Tower(8, config.widths)
+        self.tower = Tower(3, config.widths)
+        self.pair = Tower(PAIR, config.widths)
         self.place = nn.Parameter(0.02 * torch.randn(2, channels, h, w))  # of the cells, observed and rendered
-        self.space = nn.Conv2d(1, channels, 2, 2)
-        self.exchange = nn.ModuleList([Exchange(channels, config.heads) for _ in range(config.blocks)])
+        self.exchange = nn.ModuleList(
+            [Exchange(channels, config.heads, config.bottleneck) for _ in range(config.blocks)]
+        )
         self.settle = nn.BatchNorm2d(channels)
         self.match = nn.Conv2d(channels, channels, 1)
+        self.none = nn.Conv2d(channels, 1, 1)
+        self.early_none = nn.Parameter(torch.tensor(2.0))
         self.sharpness = nn.Parameter(torch.tensor([10.0, 10.0]))
-        self.coarse = nn.Sequential(conv_bn(channels + 3, 128), nn.ReLU(), Residual(128, 128), nn.Conv2d(128, 16, 1))
+        self.coarse = nn.Sequential(
+            conv_bn(channels + 4, config.bottleneck), nn.ReLU(), Residual(config.bottleneck, config.bottleneck),
+            nn.Conv2d(config.bottleneck, 16, 1),
+        )  # fmt: skip
         self.dense = Dense(config)
-        self.summary = Summary(channels + 4, config.size, FACTS)
+        self.silhouettes = Silhouettes(config)
+        self.summary = Summary(channels + 5, config.size, FACTS)
         self.heads = PoseHeads(256, with_angle=True)
+        self.score = nn.Linear(256, 1)
 
     def forward(self, observed: Tensor, rendered: Tensor, relief: Tensor, focal: Tensor) -> Prediction:
-        """observed, rendered: (B, 4, H, W). relief: (B, H/4, W/4), see ``inputs.relief``. focal: (B,), the focal length
-        in widths of the crop."""
+        """observed: (B, 3, H, W), RGB. rendered: (B, 4, H, W), RGB and mask. relief: (B, H, W), see ``inputs.relief``.
+        focal: (B,), the focal length in widths of the crop."""
         return self.predict(observed, rendered, relief, focal).prediction
 
     def predict(self, observed: Tensor, rendered: Tensor, relief: Tensor, focal: Tensor) -> LiteOutput:
         """As ``forward``, with what the losses need."""
         B = observed.shape[0]
-        fine, first = self.tower(torch.cat([observed, rendered]))
+        mask = rendered[:, 3]
+        fine, first = self.tower(torch.cat([observed, rendered[:, :3]]))
         place = self.place.repeat_interleave(B, 0).to(first.dtype)
-        together, near = self.pair(torch.cat([observed, rendered], dim=1))
-        x = first + place + F.pad(near + self.space(relief[:, None]), (0, 0, 0, 0, 0, 0, B, 0))
+        shape = [rendered[:, 3:], normals_of(relief, mask), relief[:, None]]
+        together, near = self.pair(torch.cat([observed, rendered[:, :3], *shape], dim=1))
+        x = first + place + F.pad(near, (0, 0, 0, 0, 0, 0, B, 0))
         for block in self.exchange:
             x = block(x)
         x = self.settle(x)
         cells = x[B:]
         matched = self.match(x).float()
-        likenesses = [self.sharpness[0] * likeness_of(first[B:].float(), first[:B].float()),
-                      self.sharpness[1] * likeness_of(matched[B:], matched[:B])]  # fmt: skip
-        flow, peak = soft_flow(likenesses[-1], self.config.cells)
-        found = torch.cat([flow / CELL, peak], dim=1).to(cells.dtype)
-        coarse = self.coarse(torch.cat([cells, found], dim=1))[:, :3].float()
+        none = self.none(cells).float().flatten(2).transpose(1, 2)  # (B, h * w, 1)
+        likenesses = [
+            with_none(self.sharpness[0] * likeness_of(first[B:].float(), first[:B].float()),
+                      self.early_none.expand_as(none)),
+            with_none(self.sharpness[1] * likeness_of(matched[B:], matched[:B]), none),
+        ]  # fmt: skip
+        flow, found = soft_flow(likenesses[-1], self.config.cells)
+        known = torch.cat([flow / CELL, found], dim=1).to(cells.dtype)
+        coarse = self.coarse(torch.cat([cells, known], dim=1))[:, :3].float()
         better = flow + CELL * coarse[:, :2]
-        on = rendered[:, 3, 2::ANCHOR, 2::ANCHOR]
-        first_motion = self._rigid(relief, on, focal, better, coarse[:, 2])
+        on, heights = mask[:, 2::ANCHOR, 2::ANCHOR], relief[:, 2::ANCHOR, 2::ANCHOR]
+        first_motion = self._rigid(heights, on, focal, better, coarse[:, 2])
         dense = self.dense(fine[:B], fine[B:], together, cells, first_motion)
+        silhouettes = self.silhouettes(fine[:B], x[:B])
         log_scale = dense[:, 2].clamp(-3.0, 4.0)
         fine_flow = first_motion + dense[:, :2]
-        weight = on * torch.sigmoid(dense[:, 3]) * torch.exp(-2 * log_scale)
-        surface = Surface.of(relief, focal, ANCHOR, 2.0)
+        weight = on * torch.sigmoid(dense[:, 3]) * torch.sigmoid(dense[:, 4]) * torch.exp(-2 * log_scale)
+        surface = Surface.of(heights, focal, ANCHOR, 2.0)
         motion = solve_motion(surface, points_of(fine_flow), weight.flatten(1))
         rigid = [first_motion, induced_flow(surface, motion).transpose(1, 2).unflatten(2, on.shape[1:])]
-        masks = F.avg_pool2d(torch.cat([observed[:, 3:], rendered[:, 3:]], dim=1), CELL)
-        known = [cells, (better.detach() / CELL).to(cells.dtype), masks.to(cells.dtype)]
+        masks = torch.cat([F.avg_pool2d(torch.sigmoid(silhouettes.detach()), CELL // ANCHOR),
+                           F.avg_pool2d(rendered[:, 3:], CELL)], dim=1)  # fmt: skip
+        seen = [cells, (better.detach() / CELL).to(cells.dtype), masks.to(cells.dtype)]
         facts = facts_of(motion, on, log_scale, dense[:, 3]).detach()
-        quat, v, angle = self.heads(self.summary(torch.cat(known, dim=1), facts))
+        summary = self.summary(torch.cat(seen, dim=1), facts)
+        quat, v, angle = self.heads(summary)
         assert angle is not None
-        prediction = Prediction(quat, v, expand_angle(angle), fine_flow, log_scale, dense[:, 3])
+        prediction = Prediction(
+            quat, v, expand_angle(angle), fine_flow, log_scale, dense[:, 3], dense[:, 4], silhouettes,
+            self.score(summary).float()[:, 0],
+        )  # fmt: skip
         return LiteOutput(prediction, [flow, better], rigid, angle, likenesses)
 
     def _rigid(self, relief: Tensor, on: Tensor, focal: Tensor, flow: Tensor, log_weight: Tensor) -> Tensor:
@@ -259,60 +306,42 @@ def points_of(flow: Tensor) -> Tensor:
     return flow.flatten(2).transpose(1, 2)
 
 
+def with_none(likeness: Tensor, none: Tensor) -> Tensor:
+    """(B, n, m) and (B, n, 1) -> (B, n, m + 1): the last choice is that the cell is not shown."""
+    return torch.cat([likeness, none.to(likeness.dtype)], dim=2)
+
+
 def soft_flow(likeness: Tensor, cells: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """The mean place that the softmax over each rendered cell's likenesses gives, as flow (B, 2, h, w) in pixels, and
-    the largest share of one place (B, 1, h, w)."""
+    """The mean place that the softmax over each rendered cell's likenesses (B, h * w, h * w + 1) gives, as flow
+    (B, 2, h, w) in pixels; and (B, 2, h, w), the largest share of one place and the share of none."""
     home = _grid(*cells, likeness)
-    share = torch.softmax(likeness, dim=2)
+    share = torch.softmax(likeness[:, :, :-1], dim=2)
     place = torch.einsum("bnm,cm->bcn", share, home[0].flatten(1))
-    return (place.unflatten(2, cells) - home) * CELL, share.amax(2).unflatten(1, cells)[:, None]
+    none = torch.sigmoid(likeness[:, :, -1] - torch.logsumexp(likeness[:, :, :-1], dim=2))
+    found = torch.stack([share.amax(2), none], dim=1).unflatten(2, cells)
+    return (place.unflatten(2, cells) - home) * CELL, found
 
 
-class LiteMVNet(nn.Module):
-    """MV-Net of the lite preset: SV-Net's tower, one branch's weights for all views, the paper's fused heads.
+def normals_of(relief: Tensor, mask: Tensor) -> Tensor:
+    """Unit normals (B, 3, H, W) of the rendered surface, towards the camera along -z; zero beside it.
 
-    The observed crop passes the tower once; the views' features depend on the mesh alone and can be kept
-    (``encode``, then ``match``). A branch sees, for each cell of a view, where in the observed crop it
-    finds itself (the mean of the softmax over its correlations), how surely, and both features there.
+    relief: (B, H, W), see ``inputs.relief``. mask: (B, H, W). Of the differences to the two neighbours the smaller one
+    counts, so that a fold in depth is no slope.
     """
-
-    def __init__(self, tower: Tower, config: LiteConfig = LiteConfig(), views: int = 6) -> None:
-        super().__init__()
-        self.tower, self.config, self.views = tower, config, views
-        self.sharpness = nn.Parameter(torch.tensor(10.0))
-        self.reduce = nn.Conv2d(2 * config.widths[1] + 4, 64, 1)
-        self.summary = Summary(64, config.size)
-        self.fc = nn.Linear(256 * views, 512)
-        self.heads = PoseHeads(512, with_angle=False)
-
-    def encode(self, pictures: Tensor) -> Tensor:
-        """(N, 4, H, W) -> features (N, C + 1, H/8, W/8): the tower's, and the mask pooled to cells."""
-        return torch.cat([self.tower(pictures)[1].float(), F.avg_pool2d(pictures[:, 3:], CELL)], dim=1)
-
-    def match(self, observed: Tensor, views: Tensor) -> Prediction:
-        """observed: (B, C + 1, h, w) and views: (B, M, C + 1, h, w) as ``encode`` gives them."""
-        B, M, _, h, w = views.shape
-        near = observed[:, None].expand(B, M, *observed.shape[1:]).flatten(0, 1)
-        quat, v, _ = self.heads(F.relu(self.fc(self._branch(near, views.flatten(0, 1)).view(B, M * 256))))
-        return Prediction(quat, v)
-
-    def _branch(self, observed: Tensor, view: Tensor) -> Tensor:
-        """Two (N, C + 1, h, w) -> (N, 256)."""
-        h, w = view.shape[-2:]
-        likeness = likeness_of(view[:, :-1], observed[:, :-1])
-        share = torch.softmax(self.sharpness * likeness, dim=2)
-        home = _grid(h, w, view).flatten(2)  # (1, 2, h * w)
-        place = torch.einsum("npq,xcq->ncp", share, home)
-        there = torch.einsum("npq,ncq->ncp", share, observed[:, :-1].flatten(2))
-        moved = (place - home) / w
-        found = torch.cat([moved, likeness.amax(2)[:, None], there, view.flatten(2)], dim=1)
-        return self.summary(F.relu(self.reduce(found.unflatten(2, (h, w)))))
-
-    def forward(self, observed: Tensor, views: Tensor) -> Prediction:
-        """observed: (B, 4, H, W); views: (B, M, 4, H, W), the frontal one first."""
-        return self.match(self.encode(observed), self.encode(views.flatten(0, 1)).unflatten(0, views.shape[:2]))
+    height = relief * relief.shape[2]
+    slopes = []
+    for dim in (2, 1):
+        ahead = torch.diff(height, dim=dim)
+        both = torch.diff(mask, dim=dim).abs() < 0.5  # on the object, or both beside it
+        ahead = torch.where(both, ahead, torch.full_like(ahead, 1e3))
+        edge = torch.full_like(ahead.narrow(dim, 0, 1), 1e3)
+        forward, backward = torch.cat([ahead, edge], dim), torch.cat([edge, ahead], dim)
+        slope = torch.where(forward.abs() < backward.abs(), forward, backward)
+        slopes.append(torch.where(slope.abs() > 500.0, torch.zeros_like(slope), slope))
+    up = torch.stack([*slopes, -torch.ones_like(height)], dim=1)
+    return up * (mask / up.pow(2).sum(1).sqrt())[:, None]
 
 
 def _grid(h: int, w: int, like: Tensor) -> Tensor:
-    ys, xs = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
-    return torch.stack([xs, ys]).to(device=like.device, dtype=torch.float32)[None]
+    ys, xs = torch.meshgrid(*(torch.arange(n, device=like.device) for n in (h, w)), indexing="ij")
+    return torch.stack([xs, ys]).to(dtype=torch.float32)[None]

@@ -38,8 +38,9 @@ def svnet_loss(prediction: Prediction, heads: PoseHeads, quat_wxyz: Tensor, v: T
 
 @dataclass(frozen=True)
 class DenseLossConfig:
-    """Weights of the lite preset's losses. hidden: weight of anchors that the observed picture does not show.
-    mvnet: of `first_pose_loss` beside all others."""
+    """Weights of the lite preset's losses. hidden: weight of anchors that the observed picture does not show. mvnet: of
+    MV-Net's loss beside all others. near: of the crop's width, the mean distance in it from the rendered to the true
+    place at which a pose's score should be 1/e."""
 
     gamma: float = 0.8
     hidden: float = 0.3
@@ -52,6 +53,9 @@ class DenseLossConfig:
     rotation: float = 1.0
     translation: float = 1.0
     angle: float = 1.0
+    silhouettes: float = 1.0
+    score: float = 1.0
+    near: float = 0.03
     mvnet: float = 1.0
     max_flow_px: float = 80.0
     knee_px: float = 8.0
@@ -59,7 +63,8 @@ class DenseLossConfig:
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """The truth of B pairs on h x w anchors; see ``data.pairs.Pair``. lost: bool (B,)."""
+    """The truth of B pairs on h x w anchors; see ``data.pairs.Pair``. lost: bool (B,). silhouettes: (B, 2, h, w), the
+    shares of the observed crop's 4x4 blocks in which the object is visible, and would be if nothing stood before."""
 
     flow: Tensor  # (B, 2, h, w)
     valid: Tensor  # (B, h, w) bool
@@ -68,12 +73,13 @@ class Target:
     v: Tensor  # (B, 3)
     angle: Tensor  # (B,)
     lost: Tensor  # (B,) bool
+    silhouettes: Tensor  # (B, 2, h, w)
 
 
 def dense_loss(
     output: LiteOutput, heads: PoseHeads, target: Target, config: DenseLossConfig = DenseLossConfig()
-) -> tuple[Tensor, dict[str, float]]:
-    """The lite preset's loss and its parts. Lost pairs teach the angle only."""
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """The lite preset's loss and its parts, detached. Lost pairs teach angle, score and silhouettes only."""
     prediction, flows = output.prediction, output.flows
     assert prediction.flow is not None and prediction.log_scale is not None and prediction.visibility is not None
     near = (target.flow.abs().amax(1) < config.max_flow_px) & target.valid & ~target.lost[:, None, None]
@@ -87,8 +93,9 @@ def dense_loss(
         sequence = sequence + config.gamma ** (len(flows) - 1 - k) * (error * cells).sum() / total_cells
 
     shown = F.avg_pool2d((near & target.visible)[:, None].float(), 2)[:, 0] > 0.5
-    match = matching_loss(output.likenesses[-1], flow_cells, shown)
-    early = matching_loss(output.likenesses[0], flow_cells, shown)
+    judged_cells = F.avg_pool2d((target.valid & ~target.lost[:, None, None])[:, None].float(), 2)[:, 0] > 0.5
+    match = matching_loss(output.likenesses[-1], flow_cells, shown, judged_cells)
+    early = matching_loss(output.likenesses[0], flow_cells, shown, judged_cells)
 
     total = weight.sum().clamp_min(1.0)
     error = (prediction.flow - target.flow).abs().sum(1)
@@ -107,6 +114,10 @@ def dense_loss(
     rotation = (((quat - target.quat_wxyz) / heads.quat_std).abs().mean(1) * kept).sum() / count
     translation = (((prediction.v - target.v) / heads.v_std).abs().mean(1) * kept).sum() / count
     angle = (output.compressed_angle - compress_angle(target.angle)).abs().mean()
+    assert prediction.silhouettes is not None and prediction.score is not None
+    silhouettes = F.binary_cross_entropy_with_logits(prediction.silhouettes, target.silhouettes)
+    width_px = 4 * target.flow.shape[3]
+    score = F.binary_cross_entropy_with_logits(prediction.score, true_score(target, config.near * width_px))
     loss = (
         config.flow * sequence
         + config.match * match
@@ -117,13 +128,23 @@ def dense_loss(
         + config.rotation * rotation
         + config.translation * translation
         + config.angle * angle
+        + config.silhouettes * silhouettes
+        + config.score * score
     )
     seen = (near & target.visible).float()
     epe = ((prediction.flow - target.flow).detach().norm(dim=1) * seen).sum() / seen.sum().clamp_min(1.0)
     parts = {"epe_px": epe, "match": match, "early": early, "rigid": rigids[-1], "rigid1": rigids[0],
              "likelihood": likelihood, "visibility": visibility, "rotation": rotation, "translation": translation,
-             "angle": angle}  # fmt: skip
-    return loss, {name: float(value.detach()) for name, value in parts.items()}
+             "angle": angle, "silhouettes": silhouettes, "score": score}  # fmt: skip
+    return loss, {name: value.detach() for name, value in parts.items()}
+
+
+def true_score(target: Target, near_px: float) -> Tensor:
+    """(B,) in [0, 1]: exp(-d / near_px), d the mean distance of the rendered from the true places of the surface."""
+    valid = target.valid.float()
+    distance = target.flow.nan_to_num().norm(dim=1).clamp(max=1e3)
+    mean = (distance * valid).sum((1, 2)) / valid.sum((1, 2)).clamp_min(1.0)
+    return torch.exp(-mean / near_px)
 
 
 def rigid_loss(flow: Tensor, truth: Tensor, judged: Tensor, knee: float) -> Tensor:
@@ -136,39 +157,24 @@ def rigid_loss(flow: Tensor, truth: Tensor, judged: Tensor, knee: float) -> Tens
     return (knee * torch.log1p(error / knee) * judged).sum() / judged.sum().clamp_min(1.0)
 
 
-def first_pose_loss(
-    prediction: Prediction, heads: PoseHeads, quat_wxyz: Tensor, v: Tensor
-) -> tuple[Tensor, dict[str, float]]:
-    """MV-Net lite's loss: the distance to the nearer of q and -q, which are one rotation, and the translation's in
-    normalised units. Unlike equation 1 it does not jump at half a turn. quat_wxyz: (B, 4); v: (B, 3)."""
-    near = (prediction.quat_wxyz - quat_wxyz).abs().sum(1)
-    far = (prediction.quat_wxyz + quat_wxyz).abs().sum(1)
-    rotation = torch.minimum(near, far).mean()
-    translation = ((prediction.v - v) / heads.v_std).abs().mean()
-    cosine = (F.normalize(prediction.quat_wxyz.detach()) * quat_wxyz).sum(1).abs().clamp(max=1.0)
-    angle_deg = torch.rad2deg(2 * torch.acos(cosine)).mean()
-    parts = {"mv_rotation": rotation, "mv_translation": translation, "mv_angle_deg": angle_deg}
-    return rotation + translation, {name: float(value.detach()) for name, value in parts.items()}
+def matching_loss(likeness: Tensor, flow: Tensor, shown: Tensor, judged: Tensor) -> Tensor:
+    """Cross-entropy of the cell that each rendered cell lies on in the observed crop, or of none.
 
-
-def matching_loss(likeness: Tensor, flow: Tensor, shown: Tensor) -> Tensor:
-    """Cross-entropy of the cell that each shown rendered cell lies on in the observed crop.
-
-    likeness: (B, h * w, h * w), logits. flow: (B, 2, h, w), the truth in pixels. shown: (B, h, w) bool. A place
-    between cells counts for its four neighbours, bilinearly; without it the features learn to match only
-    through the recurrent updates, several times more slowly (docs/log.md).
+    likeness: (B, h * w, h * w + 1), logits. flow: (B, 2, h, w), the truth in pixels. shown, judged: (B, h, w) bool; of
+    the judged cells those that are not shown, or lie beside the crop, are none. A place between cells counts for its
+    four neighbours, bilinearly; without this loss the features learn to match several times more slowly (docs/log.md).
     """
     B, _, h, w = flow.shape
     ys, xs = torch.meshgrid(*(torch.arange(n, device=flow.device) for n in (h, w)), indexing="ij")
     x, y = xs + flow[:, 0] / CELL, ys + flow[:, 1] / CELL
-    inside = shown & (x >= 0) & (x <= w - 1) & (y >= 0) & (y <= h - 1)
+    inside = shown & judged & (x >= 0) & (x <= w - 1) & (y >= 0) & (y <= h - 1)
     x, y = x.clamp(0, w - 1.001), y.clamp(0, h - 1.001)
     x0, y0 = x.floor(), y.floor()
     fx, fy = x - x0, y - y0
     first = (y0 * w + x0).long()
-    logits = torch.log_softmax(likeness, dim=2).view(B, h, w, h * w)
-    total = logits.new_zeros(())
+    logits = torch.log_softmax(likeness, dim=2).view(B, h, w, h * w + 1)
+    total = -(logits[..., -1] * (judged & ~inside)).sum()
     for dy, dx, share in ((0, 0, (1 - fx) * (1 - fy)), (0, 1, fx * (1 - fy)), (1, 0, (1 - fx) * fy), (1, 1, fx * fy)):
         found = logits.gather(3, (first + dy * w + dx).unsqueeze(3)).squeeze(3)
         total = total - (found * share * inside).sum()
-    return total / inside.sum().clamp_min(1)
+    return total / judged.sum().clamp_min(1)

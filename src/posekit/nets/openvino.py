@@ -24,7 +24,7 @@ from posekit.errors import ConfigError
 from posekit.nets.inputs import relief, to_input
 from posekit.nets.lite import LiteSVNet
 from posekit.nets.precision import has_fast_bfloat16
-from posekit.nets.predictor import PairPrediction, unpack
+from posekit.nets.predictor import PairPrediction, answers, unpack
 from posekit.nets.weights import Networks
 from posekit.view import View
 
@@ -56,21 +56,20 @@ class OpenVinoPredictor:
         return [self._one(o, r) for o, r in zip(observed, rendered, strict=True)]
 
     def _one(self, observed: View, rendered: View) -> PairPrediction:
-        first, second = (to_input(v.image, v.mask)[None] for v in (observed, rendered))
+        first, second = to_input(observed.image, None)[None, :3], to_input(rendered.image, rendered.mask)[None]
         focal = np.array([rendered.camera.fx / rendered.camera.width], np.float32)
         return unpack(list(self._run([first, second, relief(rendered)[None], focal]).values()), 0, rendered)
 
 
 class _Answers(nn.Module):
-    """The network with its answers in the order of ``Prediction``'s fields."""
+    """The network with its answers in the order that `unpack` takes them."""
 
     def __init__(self, svnet: LiteSVNet) -> None:
         super().__init__()
         self.svnet = svnet
 
     def forward(self, observed: Tensor, rendered: Tensor, relief: Tensor, focal: Tensor) -> tuple[Tensor, ...]:
-        out = self.svnet(observed, rendered, relief, focal)
-        return out.quat_wxyz, out.v, out.angle, out.flow, out.log_scale, out.visibility
+        return answers(self.svnet(observed, rendered, relief, focal))  # type: ignore[return-value]
 
 
 def _converted(networks: Networks) -> Any:
@@ -90,9 +89,9 @@ def _converted(networks: Networks) -> Any:
 
 def _convert(svnet: LiteSVNet) -> Any:
     width, height = svnet.config.size
-    pair = torch.zeros(1, 4, height, width)
-    pair[:, 3, height // 4 : -height // 4, width // 4 : -width // 4] = 1.0
-    example = (pair, pair, torch.zeros(1, height // 4, width // 4), torch.ones(1))
+    rendered = torch.zeros(1, 4, height, width)
+    rendered[:, 3, height // 4 : -height // 4, width // 4 : -width // 4] = 1.0
+    example = (rendered[:, :3], rendered, torch.zeros(1, height, width), torch.ones(1))
     with torch.inference_mode(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of sizes that become constants: a crop's size is one
         traced = torch.jit.trace(_Answers(svnet).eval(), example, check_trace=False)

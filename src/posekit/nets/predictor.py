@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from posekit.geometry import quat_to_rotation
+from posekit.nets.heads import Prediction
 from posekit.nets.inputs import relief, to_input
 from posekit.nets.lite import LiteSVNet
 from posekit.nets.pose_delta import PoseDelta
@@ -27,22 +29,28 @@ class Correspondences:
     """The dense head's answer for one pair, on the anchors that lie on the rendered object.
 
     source: (N, 2) integer pixels (column, row) in the crop. target: (N, 2) pixel centres in the observed crop.
-    scale_px: (N,), expected error of each. visible: (N,), probability that the observed picture shows it.
+    scale_px: (N,), expected error of each. visible: (N,), probability that the observed picture shows it. weight: (N,),
+    how much each should count for the pose beside its scale: its visibility times its certainty over the mean one.
     """
 
     source: NDArray[np.int64]
     target: NDArray[np.float64]
     scale_px: NDArray[np.float64]
     visible: NDArray[np.float64]
+    weight: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class PairPrediction:
-    """What a network says about one pair. delta: from the rendered to the observed pose. angle: radians."""
+    """What a network says about one pair. delta: from the rendered to the observed pose. angle: radians.
+    silhouettes: float32 (2, H/4, W/4), how likely each 4x4 block of the observed crop shows the object, and would
+    if nothing stood before it. score: in [0, 1], how near the pose is to the right one, for ranking hypotheses."""
 
     delta: PoseDelta
     angle: float
     correspondences: Correspondences | None = None
+    silhouettes: FArray | None = None
+    score: float | None = None
 
 
 class Predictor(Protocol):
@@ -58,43 +66,60 @@ class Predictor(Protocol):
 
 
 class NetworkPredictor:
-    """SV-Net through PyTorch. bfloat16: whether to compute in it; None = where the processor does so faster."""
+    """SV-Net through PyTorch. bfloat16: whether to compute in it; None = where the hardware does so faster. device:
+    torch's name of it; the networks are moved there."""
 
-    def __init__(self, networks: Networks, bfloat16: bool | None = None) -> None:
-        self.networks = networks
-        self.bfloat16 = has_fast_bfloat16("cpu") if bfloat16 is None else bfloat16
+    def __init__(self, networks: Networks, bfloat16: bool | None = None, device: str = "cpu") -> None:
+        self.networks, self.device = networks, torch.device(device)
+        networks.svnet.to(self.device)
+        self.bfloat16 = has_fast_bfloat16(self.device.type) if bfloat16 is None else bfloat16
         self.size = networks.size
         self.dense = networks.dense
 
     def predict(self, observed: Sequence[View], rendered: Sequence[View]) -> list[PairPrediction]:
-        svnet = self.networks.svnet
-        first = torch.from_numpy(np.stack([to_input(v.image, v.mask) for v in observed]))
-        second = torch.from_numpy(np.stack([to_input(v.image, v.mask) for v in rendered]))
-        with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=self.bfloat16):
-            if isinstance(svnet, LiteSVNet):
-                reliefs = torch.from_numpy(np.stack([relief(v) for v in rendered]))
-                focals = torch.tensor([v.camera.fx / v.camera.width for v in rendered], dtype=torch.float32)
-                out = svnet(first, second, reliefs, focals)
-            else:
-                out = svnet(first, second)
-        arrays = [None if x is None else x.float().numpy() for x in
-                  (out.quat_wxyz, out.v, out.angle, out.flow, out.log_scale, out.visibility)]  # fmt: skip
+        svnet, device = self.networks.svnet, self.device
+        dense = isinstance(svnet, LiteSVNet)
+        first = np.stack([to_input(v.image, None)[:3] if dense else to_input(v.image, v.mask) for v in observed])
+        second = np.stack([to_input(v.image, v.mask) for v in rendered])
+        inputs = [first, second]
+        if dense:
+            inputs.append(np.stack([relief(v) for v in rendered]))
+            inputs.append(np.array([v.camera.fx / v.camera.width for v in rendered], np.float32))
+        with torch.inference_mode(), torch.autocast(device.type, torch.bfloat16, enabled=self.bfloat16):
+            out = svnet(*(torch.from_numpy(array).to(device) for array in inputs))
+        arrays = [None if x is None else x.float().cpu().numpy() for x in answers(out)]
         return [unpack(arrays, k, rendered[k]) for k in range(len(observed))]
 
 
+def answers(out: Prediction) -> tuple[Tensor | None, ...]:
+    """The fields of a prediction in the order that `unpack` takes them."""
+    return (out.quat_wxyz, out.v, out.angle, out.flow, out.log_scale, out.visibility, out.certainty, out.silhouettes,
+            out.score)  # fmt: skip
+
+
 def unpack(arrays: Sequence[FArray | None], k: int, rendered: View) -> PairPrediction:
-    """The k-th pair of a batch of outputs, in the order of ``Prediction``'s fields."""
-    quat, v, angle, flow, log_scale, visibility = arrays
+    """The k-th pair of a batch of outputs, in the order of `answers`."""
+    quat, v, angle, flow, log_scale, visibility, certainty, silhouettes, score = arrays
     assert quat is not None and v is not None and angle is not None
     delta = PoseDelta(quat_to_rotation(quat[k]), v[k].astype(np.float64))
-    found = None
-    if flow is not None and log_scale is not None and visibility is not None and rendered.mask is not None:
-        rows, columns = np.nonzero(rendered.mask[2::4, 2::4])
-        source = np.stack([columns, rows], axis=1) * 4 + 2
-        found = Correspondences(
-            source=source,
-            target=source + flow[k][:, rows, columns].T.astype(np.float64),
-            scale_px=np.exp(log_scale[k][rows, columns].astype(np.float64)),
-            visible=1 / (1 + np.exp(-visibility[k][rows, columns].astype(np.float64))),
-        )
-    return PairPrediction(delta, min(max(float(angle[k]), 0.0), math.pi), found)
+    bounded = min(max(float(angle[k]), 0.0), math.pi)
+    if flow is None or rendered.mask is None:
+        return PairPrediction(delta, bounded)
+    assert log_scale is not None and visibility is not None and certainty is not None
+    assert silhouettes is not None and score is not None
+    rows, columns = np.nonzero(rendered.mask[2::4, 2::4])
+    source = np.stack([columns, rows], axis=1) * 4 + 2
+    visible, sure = (sigmoid(x[k][rows, columns].astype(np.float64)) for x in (visibility, certainty))
+    found = Correspondences(
+        source=source,
+        target=source + flow[k][:, rows, columns].T.astype(np.float64),
+        scale_px=np.exp(log_scale[k][rows, columns].astype(np.float64)),
+        visible=visible,
+        weight=visible * sure / max(float(sure.mean()), 1e-6) if len(rows) else visible,
+    )
+    return PairPrediction(delta, bounded, found, sigmoid(silhouettes[k]), float(sigmoid(score[k])))
+
+
+def sigmoid(x: Any) -> Any:
+    """The logistic function, of numbers that may be large."""
+    return 1 / (1 + np.exp(-np.clip(x, -60.0, 60.0)))

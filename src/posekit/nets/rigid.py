@@ -102,7 +102,7 @@ def solved(A: Tensor, g: Tensor) -> Tensor:
     While the network is traced for another runtime: Gauss-Jordan without pivots, in operations that each of them has.
     """
     if not torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]
-        return torch.linalg.solve(A, g[..., None])[..., 0]
+        return torch.linalg.solve_ex(A, g[..., None])[0][..., 0]  # unlike solve it does not wait for a GPU
     N = A.shape[1]
     M, eye = torch.cat([A, g[..., None]], dim=2), torch.eye(N)
     for k in range(N):

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from posekit.errors import WeightsError
 from posekit.files import write_bytes_atomic, write_text_atomic
-from posekit.nets.lite import LiteConfig, LiteMVNet, LiteSVNet
+from posekit.nets.lite import LiteConfig, LiteSVNet
 from posekit.nets.paper import Branch, PaperMVNet, PaperSVNet
 
 PRESETS = ("lite", "paper")
@@ -42,7 +42,7 @@ class Networks:
     preset: str
     config: LiteConfig | PaperConfig
     svnet: LiteSVNet | PaperSVNet
-    mvnet: LiteMVNet | PaperMVNet | None
+    mvnet: PaperMVNet | None
     digest: str = "untrained"
     about: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -61,7 +61,7 @@ def build(preset: str, config: LiteConfig | PaperConfig | None = None) -> Networ
     if preset == "lite":
         lite = config if isinstance(config, LiteConfig) else LiteConfig()
         svnet = LiteSVNet(lite)
-        return Networks(preset, lite, svnet, LiteMVNet(svnet.tower, lite))
+        return Networks(preset, lite, svnet, None)
     if preset == "paper":
         paper = config if isinstance(config, PaperConfig) else PaperConfig()
         branch = Branch(paper.size, paper.width)

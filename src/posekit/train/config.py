@@ -93,9 +93,10 @@ class SourceConfig:
 @dataclass(frozen=True)
 class TrainConfig:
     """steps: optimiser steps of the schedule. minutes: of wall clock, where above 0; whichever ends first. epochs:
-    where above 0, the steps follow from the sources (paper recipe). validate, save, log: every so many steps. keep:
-    checkpoints kept beside the best. overfit: train on the first batch again and again. cases: held-back renderings
-    that the loop is measured on. calibrate: renderings that the angle head is fitted on at the end; 0 = not at all."""
+    where above 0, the steps follow from the sources (paper recipe). validate, save, log: every so many steps.
+    export_seconds: weights and a checkpoint are written every so many seconds too, where above 0. keep: checkpoints
+    kept beside the best. overfit: train on the first batch again and again. cases: held-back renderings that the loop
+    is measured on. calibrate: renderings that the angle head is fitted on at the end; 0 = not at all."""
 
     recipe: str = "lite"
     steps: int = 7000
@@ -103,6 +104,7 @@ class TrainConfig:
     epochs: int = 0
     seed: int = 1
     validate: int = 500
+    export_seconds: float = 60.0
     save: int = 250
     log: int = 50
     keep: int = 3
@@ -113,7 +115,7 @@ class TrainConfig:
     optimiser: OptimiserConfig = OptimiserConfig()
     machine: MachineConfig = MachineConfig()
     sources: SourceConfig = SourceConfig()
-    stream: StreamConfig = StreamConfig(mvnet=8)
+    stream: StreamConfig = StreamConfig()
     lite: LiteConfig = LiteConfig()
     loss: DenseLossConfig = DenseLossConfig()
     paper: PaperConfig = field(default_factory=PaperConfig)
@@ -122,8 +124,8 @@ class TrainConfig:
         _one_of("recipe", self.recipe, RECIPES)
         if min(self.steps, self.validate, self.save, self.log, self.keep) < 1:
             raise ConfigError("steps, validate, save, log and keep are at least 1.")
-        if min(self.minutes, self.cases, self.epochs, self.calibrate) < 0:
-            raise ConfigError("minutes, epochs, cases and calibrate are not negative.")
+        if min(self.minutes, self.cases, self.epochs, self.calibrate, self.export_seconds) < 0:
+            raise ConfigError("minutes, epochs, cases, calibrate and export_seconds are not negative.")
 
     @property
     def world(self) -> int:

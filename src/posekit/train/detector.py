@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import tomllib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -60,6 +60,7 @@ class DetectorConfig:
     minutes: float = 0.0
     seed: int = 1
     validate: int = 500
+    export_seconds: float = 0.0
     save: int = 250
     log: int = 20
     keep: int = 2
@@ -212,7 +213,9 @@ class DetectorTask:
                               photos=self.sources.photos, distractors=self.sources.distractors, start=start,
                               rank=rank)  # fmt: skip
 
-    def prepare(self, batches: Callable[[int], Iterator[Batch]]) -> None:
+    measured = 0
+
+    def prepare(self, batches: Sequence[Batch]) -> None:
         """Nothing has to be measured before."""
 
     def validate(self, nets: nn.Module) -> dict[str, float]:

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 from torch.utils.data import IterableDataset
 
 from posekit.data.stream import Batch, PairStream
-from posekit.nets.heads import PoseHeads
 from posekit.nets.inputs import images_to_tensor
-from posekit.nets.lite import LiteMVNet, LiteSVNet
-from posekit.nets.losses import DenseLossConfig, Target, dense_loss, first_pose_loss
+from posekit.nets.lite import LiteSVNet
+from posekit.nets.losses import DenseLossConfig, Target, dense_loss
 from posekit.nets.weights import Networks
 from posekit.train.config import TrainConfig
 from posekit.train.sources import Sources
 from posekit.train.task import PoseTask
 
-MEASURED = 20  # batches that the statistics are measured on
+MEASURED = 640  # pairs that the statistics are measured on
 
 
 class LiteModule(nn.Module):
@@ -29,7 +27,7 @@ class LiteModule(nn.Module):
         super().__init__()
         self.nets, self.config = nets, config
 
-    def forward(self, batch: Batch, seed: int) -> tuple[Tensor, dict[str, float]]:  # noqa: ARG002 - nothing is drawn
+    def forward(self, batch: Batch, seed: int) -> tuple[Tensor, dict[str, Tensor]]:  # noqa: ARG002 - nothing is drawn
         svnet = self.nets["svnet"]
         assert isinstance(svnet, LiteSVNet)
         output = svnet.predict(
@@ -38,30 +36,15 @@ class LiteModule(nn.Module):
             batch["relief"].float(),
             batch["focal"],
         )
-        first = self._first_pose(batch) if "mvnet" in self.nets else None
         with torch.autocast(batch["flow"].device.type, enabled=False):
             loss, parts = dense_loss(output, svnet.heads, target_of(batch), self.config)
-            if first is not None:
-                heads = self.nets["mvnet"].heads
-                assert isinstance(heads, PoseHeads)
-                added, more = first_pose_loss(first, heads, batch["mv_quat_wxyz"], batch["mv_v"])
-                loss, parts = loss + self.config.mvnet * added, parts | more
         return loss, parts
-
-    def _first_pose(self, batch: Batch) -> Any:
-        mvnet = self.nets["mvnet"]
-        assert isinstance(mvnet, LiteMVNet)
-        observed, views = batch["mv_observed"], batch["mv_views"]
-        pictures = images_to_tensor(torch.cat([observed, views.flatten(0, 1)]))
-        features = mvnet.encode(pictures)
-        kept = features[len(observed) :].unflatten(0, views.shape[:2])
-        return mvnet.match(features[: len(observed)], kept[batch["mv_object"]])
 
 
 def target_of(batch: Batch) -> Target:
     """The truth of a batch's pairs."""
     return Target(batch["flow"], batch["valid"], batch["visible"], batch["quat_wxyz"], batch["v"], batch["angle"],
-                  batch["lost"])  # fmt: skip
+                  batch["lost"], batch["silhouettes"].float() / 255)  # fmt: skip
 
 
 class LiteTask(PoseTask):
@@ -76,15 +59,12 @@ class LiteTask(PoseTask):
         return PairStream(self.config.stream, self.config.seed, self.sources.photos, self.sources.models, start=start,
                           rank=rank)  # fmt: skip
 
-    def prepare(self, batches: Callable[[int], Iterator[Batch]]) -> None:
+    @property
+    def measured(self) -> int:
+        return -(-MEASURED // self.config.stream.batch) if self.fresh else 0
+
+    def prepare(self, batches: Sequence[Batch]) -> None:
         """The paper's zero mean and unit variance, where the networks are new."""
-        if not self.fresh:
-            return
-        stream = batches(0)
-        found = [next(stream) for _ in range(MEASURED)]
         if "svnet" in self.fresh:
-            quat, v = (torch.cat([b[key][~b["lost"]] for b in found]) for key in ("quat_wxyz", "v"))
+            quat, v = (torch.cat([b[key][~b["lost"]] for b in batches]) for key in ("quat_wxyz", "v"))
             self.heads("svnet").set_statistics(quat, v)
-        if "mvnet" in self.fresh:
-            quat, v = (torch.cat([b[key] for b in found]) for key in ("mv_quat_wxyz", "mv_v"))
-            self.heads("mvnet").set_statistics(quat, v)

@@ -11,6 +11,7 @@ killed ends as one that was not.
 from __future__ import annotations
 
 import ctypes
+import itertools
 import logging
 import math
 import os
@@ -19,6 +20,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import torch
@@ -36,6 +38,8 @@ from posekit.train.log import Curves
 Batch = dict[str, Tensor]
 M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # malloc.h
 PROFILED = (3, 10)  # steps that --profile leaves out, and then records
+PATIENCE = 20  # steps in a row without a finite gradient that a GPU leaves out before the training ends
+SHOWN = 0.5  # seconds between two looks at the losses: a look waits for the GPU
 
 
 class Schedule(Protocol):
@@ -51,6 +55,8 @@ class Schedule(Protocol):
     def seed(self) -> int: ...
     @property
     def validate(self) -> int: ...
+    @property
+    def export_seconds(self) -> float: ...
     @property
     def save(self) -> int: ...
     @property
@@ -86,9 +92,14 @@ class Task(Protocol):
         """Process ``rank``'s batches from number ``start`` on."""
         ...
 
-    def prepare(self, batches: Callable[[int], Iterator[Batch]]) -> None:
-        """Measure what has to be known before the first step. Called by one process, for a new training; it must not
-        draw, since worker processes are forked after it. batches: from a number on."""
+    @property
+    def measured(self) -> int:
+        """Batches that `prepare` measures."""
+        ...
+
+    def prepare(self, batches: Sequence[Batch]) -> None:
+        """Measure what has to be known before the first step, on the first batches. Called by one process, for a new
+        training."""
         ...
 
     def validate(self, nets: nn.Module) -> dict[str, float]:
@@ -159,6 +170,7 @@ def make_fabric(config: Schedule) -> Any:
         ) from error
     if machine.threads:
         torch.set_num_threads(machine.threads)
+    torch.backends.cudnn.benchmark = True  # crops of one size: the fastest convolution is sought once
     return fabric
 
 
@@ -171,6 +183,33 @@ def make_optimiser(nets: nn.Module, config: Schedule) -> torch.optim.Optimizer:
     if chosen.kind == "sgd":
         return torch.optim.SGD(groups, lr=chosen.rate, momentum=chosen.momentum)
     return torch.optim.AdamW(groups, lr=chosen.rate, fused=config.machine.precision != "16-mixed")
+
+
+class Means:
+    """Running means of the loss and its parts, kept on the training's device so that a step need not wait for it.
+
+    A step with a value that is not finite leaves them alone; ``failed`` counts such steps in a row.
+    """
+
+    def __init__(self, values: Mapping[str, float] = MappingProxyType({})) -> None:
+        self.names = tuple(values)
+        self.mean: Tensor | None = torch.tensor(list(values.values())) if values else None
+        self.failed: Tensor | None = None
+
+    def update(self, values: Mapping[str, Tensor]) -> None:
+        """values: scalars, of the same names in every step."""
+        names, new = tuple(values), torch.stack([v.detach().float() for v in values.values()])
+        finite = torch.isfinite(new).all()
+        if self.mean is None or names != self.names:
+            self.names, self.mean = names, new
+        old = self.mean.to(new.device)
+        self.mean = torch.where(finite, 0.98 * old + 0.02 * new, old)
+        failed = torch.zeros((), device=new.device) if self.failed is None else self.failed
+        self.failed = torch.where(finite, torch.zeros_like(failed), failed + 1)
+
+    def read(self) -> dict[str, float]:
+        """Waits for the device."""
+        return {} if self.mean is None else dict(zip(self.names, self.mean.tolist(), strict=True))
 
 
 def _show_nothing(progress: Progress) -> None:
@@ -190,7 +229,8 @@ class Trainer:
         self.raw = raw
         self.average = AveragedModel(task.nets, multi_avg_fn=self._average, use_buffers=True)
         self.step, self.seconds, self.score = 0, 0.0, math.nan
-        self.means: dict[str, float] = {}
+        self.running = Means()
+        self.shown = self.exported = 0.0
 
     # --- the loop ---
 
@@ -201,9 +241,11 @@ class Trainer:
         OutputError where the disk is full.
         """
         resumed = self._resume()
-        if not resumed:
-            self._start()
         batches = self._batches(self.step)
+        ready = [next(batches) for _ in range(1 if resumed else max(1, self.task.measured))]
+        if not resumed:
+            self._start(ready)
+        batches = itertools.chain(ready, batches)  # the workers have begun before the clock does
         curves = Curves(self.out, self.step) if self.first else None
         if curves and not curves.rows("validation"):
             self._validate(curves)
@@ -228,10 +270,20 @@ class Trainer:
         return curves.rows("validation") if curves else []
 
     def _batches(self, start: int) -> Iterator[Batch]:
-        return loader(self.task.stream(start, self.fabric.global_rank), self.config.machine.workers)
+        on_gpu = self.fabric.device.type == "cuda"
+        return loader(self.task.stream(start, self.fabric.global_rank), self.config.machine.workers, on_gpu)
 
-    def train_step(self, batch: Batch, done: float, also: Mapping[str, float] | None = None) -> dict[str, float]:
-        """One optimiser step; returns the loss and its parts. also: further values to log."""
+    @property
+    def means(self) -> dict[str, float]:
+        """Running means of the loss and its parts."""
+        return self.running.read()
+
+    def train_step(self, batch: Batch, done: float, also: Mapping[str, float] | None = None) -> dict[str, Tensor]:
+        """One optimiser step; returns the loss and its parts, detached scalars. also: further values to log.
+
+        On a GPU nothing in it waits for the device: a gradient that is not finite is left out there, and found out
+        about at the next look at the losses. On a CPU it ends the training. Raises TrainingError.
+        """
         rank, world = self.fabric.global_rank, self.fabric.world_size
         drawn = 0 if self.config.overfit else self.step
         seed = (self.config.seed * 1_000_003 + drawn) * world + rank
@@ -245,13 +297,22 @@ class Trainer:
         norm = self.fabric.clip_gradients(
             self.module, self.optimiser, max_norm=self.config.optimiser.clip, error_if_nonfinite=False
         )
-        self._check_finite(float(loss.detach()), float(norm))
+        if self.on_gpu:
+            self.raw.found_inf = (~torch.isfinite(norm)).float()  # type: ignore[attr-defined]  # a fused step skips
+        else:
+            self._check_finite(float(loss.detach()), float(norm))
         self.optimiser.step()
         self.average.update_parameters(self.task.nets)
         self.step += 1
-        values = {"loss": float(loss.detach()), **parts, "norm": float(norm), **(also or {})}
-        self.means = {k: v if k not in self.means else 0.98 * self.means[k] + 0.02 * v for k, v in values.items()}
+        extra = {k: torch.tensor(v) for k, v in (also or {}).items()} if not self.on_gpu else {}
+        found = {"loss": loss.detach(), **parts, "norm": norm.detach(), **extra}
+        values = {k: torch.as_tensor(v, dtype=torch.float32, device=loss.device) for k, v in found.items()}
+        self.running.update(values)
         return values
+
+    @property
+    def on_gpu(self) -> bool:
+        return bool(self.fabric.device.type == "cuda") and self.config.machine.precision != "16-mixed"
 
     def _check_finite(self, loss: float, norm: float) -> None:
         """The gradient is averaged over all processes: one that is not finite stops them together, before the weights
@@ -279,15 +340,28 @@ class Trainer:
         return float(done)
 
     def _now_and_then(self, curves: Curves) -> None:
-        self.show(Progress(self.step, self._share(), self.seconds, self.means))
         ended = self._share() >= 1
-        if self.step % self.config.log == 0 or ended:
-            curves.add("train", self.step, self.seconds, self.means)
+        logged = self.step % self.config.log == 0 or ended
+        if logged or self.seconds - self.shown >= SHOWN:
+            self._look(curves if logged else None)
         self.score = math.nan
+        due = 0 < self.config.export_seconds <= self.seconds - self.exported
         if self.step % self.config.validate == 0 or ended:
             self._validate(curves)
-        if self.step % self.config.save == 0 or ended:
+        elif due:
+            self._export({})
+        if self.step % self.config.save == 0 or due or ended:
             self.save()
+            self.exported = self.seconds
+
+    def _look(self, curves: Curves | None) -> None:
+        """At the losses, which waits for the device."""
+        self.shown, means = self.seconds, self.means
+        if self.running.failed is not None and float(self.running.failed) > PATIENCE:
+            self._check_finite(math.nan, math.nan)
+        self.show(Progress(self.step, self._share(), self.seconds, means))
+        if curves is not None:
+            curves.add("train", self.step, self.seconds, means)
 
     def _share(self) -> float:
         """As `_done`, by this process's own clock."""
@@ -301,15 +375,19 @@ class Trainer:
             found = self.task.validate(averaged)
         self.score = found["score"]
         curves.add("validation", self.step, self.seconds, found)
+        self._export(found)
+
+    def _export(self, found: Mapping[str, float]) -> None:
+        """The averaged weights. found: their validation, where there was one."""
         about = {"recipe": self.config.recipe, "steps": self.step, "hours": self.seconds / 3600, "held_back": found}
-        self.task.export(averaged, self.out, about)
+        self.task.export(self.average.module, self.out, about)
 
     # --- state ---
 
-    def _start(self) -> None:
+    def _start(self, batches: Sequence[Batch]) -> None:
         """A new training: measure, and tell the other processes."""
         if self.first:
-            self.task.prepare(self._batches)
+            self.task.prepare(batches)
         if self.fabric.world_size > 1:
             state = self.fabric.broadcast({k: v.cpu() for k, v in self.task.nets.state_dict().items()})
             self.task.nets.load_state_dict(state)
@@ -328,7 +406,8 @@ class Trainer:
         if step is None:
             return False
         found = self.checkpoints.load(step)
-        self.step, self.seconds, self.means = found.step, found.seconds, dict(found.means)
+        self.step, self.seconds, self.running = found.step, found.seconds, Means(found.means)
+        self.shown = self.exported = self.seconds
         self.task.nets.load_state_dict(part(found.tensors, "net."))
         self.average.load_state_dict(part(found.tensors, "average."))
         restore_optimiser(self.raw, part(found.tensors, "optimiser."))
@@ -338,10 +417,12 @@ class Trainer:
     def _average(self, averages: Sequence[Tensor], currents: Sequence[Tensor], count: Tensor | int) -> None:
         """An exponential moving average that forgets its first values faster: the decay grows to ``ema``."""
         decay = min(self.config.optimiser.ema, (1.0 + float(count)) / (10.0 + float(count)))
-        for average, current in zip(averages, currents, strict=True):
-            if average.is_floating_point():
-                average.lerp_(current.to(average.dtype), 1.0 - decay)
-            else:
+        pairs = list(zip(averages, currents, strict=True))
+        floats = [(a, c.to(a.dtype)) for a, c in pairs if a.is_floating_point()]
+        if floats:
+            torch._foreach_lerp_([a for a, _ in floats], [c for _, c in floats], 1.0 - decay)
+        for average, current in pairs:
+            if not average.is_floating_point():
                 average.copy_(current)
 
     def _profiler(self) -> AbstractContextManager[Any]:
@@ -357,8 +438,30 @@ class Trainer:
         )
 
 
-def loader(stream: IterableDataset[Batch], workers: int) -> Iterator[Batch]:
-    """A stream's batches, made in ``workers`` processes (0: in this one) while the network trains."""
-    context = "fork" if workers else None  # the workers share the pictures and meshes that are loaded already
-    return iter(DataLoader(stream, batch_size=None, num_workers=workers, multiprocessing_context=context,
-                           prefetch_factor=6 if workers else None))  # fmt: skip
+def loader(stream: IterableDataset[Batch], workers: int, on_gpu: bool = False) -> Iterator[Batch]:
+    """A stream's batches, made in ``workers`` processes (0: in this one) while the network trains.
+
+    on_gpu: the batches are pinned, and the workers start from a fresh process, since one that is forked after CUDA has
+    begun may hang in the driver; otherwise they share what is loaded already. Raises TrainingError where the workers
+    make no batch for some minutes.
+    """
+    context = ("forkserver" if on_gpu else "fork") if workers else None
+    wait = (60 if on_gpu else 600) if workers else 0
+    batches = DataLoader(
+        stream,
+        batch_size=None,
+        num_workers=workers,
+        multiprocessing_context=context,
+        prefetch_factor=(2 if on_gpu else 6) if workers else None,
+        pin_memory=on_gpu,
+        timeout=wait,
+    )
+    try:
+        yield from batches
+    except RuntimeError as error:
+        if "timed out" not in str(error):
+            raise
+        raise TrainingError(
+            f"the {workers} processes that render and augment made no batch within {wait} seconds. See whether "
+            "`posekit doctor` can draw here, and pass fewer --workers."
+        ) from error

@@ -7,7 +7,7 @@ rotation takes its place.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -201,17 +201,18 @@ class PaperTask(PoseTask):
         return SceneStream(self.config.stream, self.config.seed, self.catalogue, self.sources.photos, start=start,
                            rank=rank)  # fmt: skip
 
-    def prepare(self, batches: Callable[[int], Iterator[Batch]]) -> None:
+    @property
+    def measured(self) -> int:
+        return MEASURED if self.fresh else 0
+
+    def prepare(self, batches: Sequence[Batch]) -> None:
         """Zero mean and unit variance of both networks' targets; SV-Net's from small random disturbances."""
-        if not self.fresh:
-            return
-        stream, rng = batches(0), np.random.default_rng(self.config.seed)
-        found = [next(stream) for _ in range(MEASURED)]
+        rng = np.random.default_rng(self.config.seed)
         if "mvnet" in self.fresh:
-            quat, v = (torch.cat([b[key] for b in found]) for key in ("mv_quat_wxyz", "mv_v"))
+            quat, v = (torch.cat([b[key] for b in batches]) for key in ("mv_quat_wxyz", "mv_v"))
             self.heads("mvnet").set_statistics(quat, v)
         if "svnet" in self.fresh:
-            scenes = [s for b in found for s in unpack(b, self.catalogue.models)]
+            scenes = [s for b in batches for s in unpack(b, self.catalogue.models)]
             starts = [disturbed_pose(s.truth, s.model.diameter, rng) for s in scenes]
             crops = [zoomed(s, start, self.networks.size) for s, start in zip(scenes, starts, strict=True)]
             quat, v, _ = _targets([crop.delta for crop in crops])

@@ -18,7 +18,7 @@ from posekit.data.procedural import random_object
 from posekit.data.scene_stream import Catalogue
 from posekit.errors import ConfigError, OutputError, WeightsError
 from posekit.files import write_text_atomic
-from posekit.nets.lite import LiteConfig, LiteMVNet, LiteSVNet
+from posekit.nets.lite import LiteSVNet
 from posekit.nets.weights import Networks, build, load_networks, save_networks
 from posekit.render import Renderer
 from posekit.train.calibrate import SEED, calibrate
@@ -158,9 +158,7 @@ def make_networks(config: TrainConfig) -> tuple[Networks, frozenset[str]]:
     if networks.mvnet is not None:
         return networks, frozenset()
     if isinstance(networks.svnet, LiteSVNet):
-        assert isinstance(networks.config, LiteConfig)
-        mvnet = LiteMVNet(networks.svnet.tower, networks.config)
-        return dataclasses.replace(networks, mvnet=mvnet), frozenset({"mvnet"})
+        return networks, frozenset()
     raise WeightsError(f"the weights {init} hold no MV-Net, which the paper recipe trains too: start without --init.")
 
 
