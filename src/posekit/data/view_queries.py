@@ -1,4 +1,4 @@
-"""Training data of the matching MV-Net: rendered views of a mesh, and crops of rough boxes to compare with them. Layer 3.
+"""Training data of the matching MV-Net: rendered views of a mesh, and crops of rough boxes. Layer 3.
 
 Lengths are in diameters of the object, points in its centred frame. A view shows the object at `DISTANCE` from one
 direction, scaled so that it fills the picture; a template is a view turned by a multiple of 90 degrees in the picture:
@@ -77,8 +77,8 @@ class QueryConfig:
 
 @dataclass(frozen=True, eq=False)
 class ViewBank:
-    """A mesh from M directions. pictures: uint8 (M, 64, 64, 4), RGB and mask. coords: float16 (M, 64, 64, 3), the points
-    seen. rotations: (M, 3, 3), R_view_ctr. intrinsics: (M, 3), focal length and principal point, pixels."""
+    """A mesh from M directions. pictures: uint8 (M, 64, 64, 4), RGB and mask. coords: float16 (M, 64, 64, 3), the
+    points seen. rotations: (M, 3, 3), R_view_ctr. intrinsics: (M, 3), focal length and principal point, pixels."""
 
     pictures: Image
     coords: NDArray[np.float16]

@@ -1,4 +1,4 @@
-"""MV-Net that matches: the crop of a rough box against rendered views of the mesh; mask, score and first poses come out.
+"""MV-Net that matches: a rough box's crop against rendered views of the mesh; mask, score and first poses come out.
 
 A view is a square picture of the mesh from one direction and at one in-plane turn. The tower, shared with SV-Net,
 describes crop and views alike. Codes, cheap to compare, choose a few views; blocks of cross-attention between the
@@ -71,9 +71,11 @@ class Matches(NamedTuple):
 
 
 class MVOutput(NamedTuple):
-    """Of a training step. selection: (B, K), logits of the views. matches: with the chosen ones."""
+    """Of a training step. selection: (B, K), logits of the views. early: (B, k, h * w, 64), logits of the cells of the
+    chosen ones by the codes alone. matches: with the chosen ones."""
 
     selection: Tensor
+    early: Tensor
     matches: Matches
 
 
@@ -179,7 +181,8 @@ class MatchingMVNet(nn.Module):
     views: directions. kept: views that are looked at closely. channels: of the tokens. part: of the codes of cells."""
 
     def __init__(self, tower: nn.Module, config: MatchingConfig, views: int = 42, kept: int = 8, *,
-                 channels: int = 128, heads: int = 4, blocks: int = 3, inner: int = 64, part: int = 32) -> None:  # fmt: skip
+                 channels: int = 128, heads: int = 4, blocks: int = 3, inner: int = 64,
+                 part: int = 32) -> None:  # fmt: skip
         super().__init__()
         self.tower, self.config, self.views, self.kept = tower, config, views, kept
         self.rows, self.columns = config.size[1] // CELL, config.size[0] // CELL
@@ -190,7 +193,7 @@ class MatchingMVNet(nn.Module):
         self.view_place = nn.Parameter(0.02 * torch.randn(1, channels, GRID, GRID))
         self.crop_code, self.view_code = Code(channels, (self.rows, self.columns)), Code(channels, (GRID, GRID))
         self.part = nn.Linear(channels, part)
-        self.sharpness = nn.Parameter(torch.tensor([8.0, 8.0]))
+        self.sharpness = nn.Parameter(torch.tensor([8.0, 8.0, 8.0]))
         self.blocks = nn.ModuleList([Block(channels, heads, inner) for _ in range(blocks)])
         self.leave, self.view_leave = nn.LayerNorm(channels), nn.LayerNorm(channels)
         self.match, self.view_match = nn.Linear(channels, channels), nn.Linear(channels, channels)
@@ -258,7 +261,9 @@ class MatchingMVNet(nn.Module):
         selection = self.select(seen, whole, parts, share)
         index = (item[:, None] * K + chosen).flatten()
         kept = encoded.tokens.index_select(0, index).unflatten(0, chosen.shape)
-        return MVOutput(selection, self.compare(seen.fine, seen.tokens, kept))
+        near = encoded.parts.index_select(0, index).unflatten(0, chosen.shape)
+        early = self.sharpness[2] * (seen.parts[:, None] @ near.transpose(2, 3)).float()
+        return MVOutput(selection, early, self.compare(seen.fine, seen.tokens, kept))
 
 
 def rgb_input(rgb: Tensor) -> Tensor:

@@ -14,12 +14,13 @@ from posekit.nets.mvnet import NONE, MVOutput
 
 @dataclass(frozen=True)
 class MVLossConfig:
-    """Weights of the parts. none: of the cells that are in no view, beside ``match``. reach: cosine of the largest
-    angle between two directions of view for which the turn is asked."""
+    """Weights of the parts. none: of the cells that are in no view, beside ``match``. early: of matches by codes alone.
+    reach: cosine of the largest angle between two directions of view for which the turn is asked."""
 
     selection: float = 0.5
     match: float = 1.0
     none: float = 0.5
+    early: float = 0.3
     offset: float = 1.0
     silhouette: float = 2.0
     dice: float = 0.5
@@ -42,6 +43,7 @@ def mvnet_loss(
     count = there.sum().clamp_min(1.0)
     parts = {"selection": _selection(output.selection, target["mv_near_all"].float(), there, count)}
     parts["match"], parts["none"] = _cells(m.cells, target["mv_cell"], there)
+    parts["early"] = _early(output.early, target["mv_cell"], there)
     parts["offset"] = _offset(m.offsets, target["mv_offset"].float(), target["mv_cell"], there)
     parts["silhouette"], parts["dice"] = _silhouettes(m.silhouettes, target["mv_silhouettes"].float(), there, count)
     score = F.binary_cross_entropy_with_logits(m.scores, target["mv_near"].float(), reduction="none").mean(1)
@@ -68,6 +70,13 @@ def _cells(logits: Tensor, cell: Tensor, there: Tensor) -> tuple[Tensor, Tensor]
     unmatched = here - matched
     return ((error * matched).sum() / matched.sum().clamp_min(1.0),
             (error * unmatched).sum() / unmatched.sum().clamp_min(1.0))  # fmt: skip
+
+
+def _early(logits: Tensor, cell: Tensor, there: Tensor) -> Tensor:
+    """Cross-entropy of matched cells. logits: (B, k, h * w, 64), without none."""
+    error = F.cross_entropy(logits.flatten(0, 2), cell.clamp_max(NONE - 1).flatten(), reduction="none")
+    matched = (cell != NONE).float() * there[:, None, None]
+    return (error.view(cell.shape) * matched).sum() / matched.sum().clamp_min(1.0)
 
 
 def _offset(offsets: Tensor, truth: Tensor, cell: Tensor, there: Tensor) -> Tensor:
