@@ -11,22 +11,27 @@ import torch
 from torch import Tensor, nn
 
 from objects import bracket
+from posekit.camera import Camera, mask_box
 from posekit.data.procedural import random_object
 from posekit.data.view_queries import (
-    DISTANCE,
     QueryConfig,
     QueryGroup,
     QueryScene,
     Relation,
-    ViewBank,
     collate_queries,
     draw_queries,
     match_targets,
     render_queries,
 )
+from posekit.geometry import Pose, fibonacci_sphere, random_rotation, rotation_angle, rotation_between
+from posekit.mvnet_search import Answer, MatchingSearch
 from posekit.nets.mvnet import CELL, GRID, NONE, MatchingMVNet, MVOutput, rgb_input, view_input
 from posekit.nets.mvnet_loss import MVLossConfig, mvnet_loss
+from posekit.object_model import ObjectModel
 from posekit.render import Renderer
+from posekit.results import Detection
+from posekit.view import View
+from posekit.view_bank import DISTANCE, ViewBank
 
 QUERIES = QueryConfig(queries=2, templates=8, kept=4, views=12, absent=0.0)
 
@@ -64,7 +69,7 @@ def renderer() -> Renderer:
 @pytest.fixture(scope="module")
 def made(renderer: Renderer) -> tuple[ViewBank, list[QueryScene], list[QueryScene]]:
     rng = np.random.default_rng(4)
-    bank = ViewBank.of(bracket(), renderer, QUERIES)
+    bank = ViewBank.of(bracket(), renderer, fibonacci_sphere(QUERIES.views))
     other = random_object(rng)
     return (bank, render_queries(renderer, bracket(), 4, QUERIES, rng),
             render_queries(renderer, other, 3, QUERIES, rng))  # fmt: skip
@@ -162,3 +167,62 @@ def test_the_turn_is_the_one_between_pictures(made) -> None:  # type: ignore[no-
     assert np.allclose(relation.facing, 1, atol=1e-6)
     assert np.allclose(relation.turn, [[1, 0], [0, 1], [-1, 0], [0, -1]], atol=1e-6)
     assert relation.near.argmax() == 0
+
+
+def oracle(search: MatchingSearch, crop: View, T_crop_ctr: Pose, model: ObjectModel, matched: bool) -> Answer:
+    """What a perfect network says of a crop whose truth is known; without ``matched`` it finds no cells."""
+    camera, (h, w) = crop.camera, QUERIES.cells
+    drawn = Renderer().render(model, [T_crop_ctr @ model.T_obj_ctr.inverse()], camera.resized(w, h), rgb=False)[0]
+    mask = Renderer().render(model, [T_crop_ctr @ model.T_obj_ctr.inverse()], camera.resized(2 * w, 2 * h))[0].mask
+    assert drawn.coords is not None and drawn.mask is not None and mask is not None
+    R = rotation_between(T_crop_ctr.t, [0, 0, 1]) @ T_crop_ctr.R
+    relation = Relation.of(R, search.rotations, QUERIES)
+    best = np.argsort(-relation.near)[:8].astype(np.int64)
+    coords = ((drawn.coords - model.center) / model.diameter).astype(np.float32)
+    cell, offset = match_targets(search.bank, best, coords, drawn.mask, QUERIES.tolerance)
+    logits = np.zeros((8, h * w, 65), np.float32)
+    np.put_along_axis(logits, cell[..., None] if matched else np.full_like(cell, NONE)[..., None], 12.0, axis=2)
+    silhouette = np.where(mask, 8.0, -8.0).astype(np.float32)
+    return Answer(best, logits, offset.reshape(8, 2, h, w), np.stack([silhouette] * 2),
+                  relation.near[best].astype(np.float32), relation.turn[best].astype(np.float32), 4.0)  # fmt: skip
+
+
+@pytest.mark.parametrize("matched", [True, False])
+def test_an_oracle_gives_the_true_pose(renderer: Renderer, matched: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, camera = bracket((0.02, 0.0, -0.01)), Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
+    search = MatchingSearch(model, small_net().eval(), renderer)
+    rng = np.random.default_rng(2)
+    turns, places, overlaps = [], [], []
+    for _ in range(6):
+        place = np.array([rng.uniform(-0.2, 0.2), rng.uniform(-0.15, 0.15), rng.uniform(0.5, 0.9)])
+        truth = Pose(random_rotation(rng), place) @ model.T_obj_ctr.inverse()
+        drawn = renderer.render(model, [truth], camera)[0]
+        assert drawn.mask is not None
+        box = mask_box(drawn.mask)
+        assert box is not None
+        detection = Detection((box[0] - 6, box[1] + 4, box[2] + 3, box[3] + 8))
+
+        def told(crop: View, truth: Pose = truth) -> Answer:
+            T_crop_ctr = Pose.rotation(crop.R_view_cam) @ truth @ model.T_obj_ctr
+            return oracle(search, crop, T_crop_ctr, model, matched)
+
+        monkeypatch.setattr(search, "answer", told)
+        result = search.examine(View(drawn.image, camera), detection, 3)
+        best = result.hypotheses[0].T_cam_obj
+        turns.append(np.rad2deg(rotation_angle(best.R.T @ truth.R)))
+        places.append(np.linalg.norm((best @ model.T_obj_ctr).t - place) / place[2])
+        overlaps.append((result.mask & drawn.mask).sum() / (result.mask | drawn.mask).sum())
+        assert result.presence > 0.9
+    assert np.mean(overlaps) > 0.8
+    if matched:
+        assert max(turns) < 4.0 and max(places) < 0.02
+    else:
+        assert np.median(turns) < 25.0 and np.median(places) < 0.1
+
+
+def test_the_search_runs_untrained(renderer: Renderer) -> None:
+    search = MatchingSearch(bracket(), small_net().eval(), renderer)
+    view = View(np.zeros((480, 640, 3), np.uint8), Camera(572.4, 573.6, 325.3, 242.0, 640, 480))
+    found = search.examine(view, Detection((200, 150, 320, 260)), 5)
+    assert found.mask.shape == (480, 640) and 0 <= found.presence <= 1 and len(found.hypotheses) <= 5
+    assert all(np.isfinite(h.T_cam_obj.matrix).all() for h in found.hypotheses)

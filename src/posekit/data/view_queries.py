@@ -1,9 +1,8 @@
 """Training data of the matching MV-Net: rendered views of a mesh, and crops of rough boxes. Layer 3.
 
-Lengths are in diameters of the object, points in its centred frame. A view shows the object at `DISTANCE` from one
-direction, scaled so that it fills the picture; a template is a view turned by a multiple of 90 degrees in the picture:
-template ``turns * view + turn``. A query is the crop of a disturbed box, rendered as it is and photographed badly when
-it is drawn. Every random number comes from the generator given.
+A query is the crop of a disturbed box, rendered as it is and photographed badly when it is drawn; it is compared with
+templates of a `view_bank.ViewBank`. Lengths are in diameters of the object, points in its centred frame. Every random
+number comes from the generator given.
 """
 
 from __future__ import annotations
@@ -21,21 +20,16 @@ from posekit.camera import Box, Camera
 from posekit.data.augment import AugmentConfig, observe
 from posekit.data.pairs import random_light
 from posekit.data.procedural import random_colour
-from posekit.geometry import Pose, fibonacci_sphere, random_rotation, rotation_between, view_rotation
-from posekit.nets.mvnet import CELL, GRID, NONE, VIEW
+from posekit.geometry import Pose, random_rotation, rotation_between
+from posekit.nets.mvnet import CELL, GRID, NONE
 from posekit.object_model import ObjectModel
-from posekit.render import Light, Renderer
+from posekit.render import Renderer
+from posekit.view_bank import ViewBank
 from posekit.zoom import zoom_to_box
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Rng = np.random.Generator
-
-DISTANCE = 4.0  # of the views' camera, in diameters
-FILL = 0.9  # of a view's side that the object takes
-TURNS = 4
-HEADLIGHT = Light(ambient=0.5, direction=(0.0, 0.0, -1.0), diffuse=0.5, specular=0.0)
-_QUARTER = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # what np.rot90 does to a picture's frame
 
 
 @dataclass(frozen=True)
@@ -73,73 +67,6 @@ class QueryConfig:
     def cells(self) -> tuple[int, int]:
         """(rows, columns)."""
         return self.crop[1] // CELL, self.crop[0] // CELL
-
-
-@dataclass(frozen=True, eq=False)
-class ViewBank:
-    """A mesh from M directions. pictures: uint8 (M, 64, 64, 4), RGB and mask. coords: float16 (M, 64, 64, 3), the
-    points seen. rotations: (M, 3, 3), R_view_ctr. intrinsics: (M, 3), focal length and principal point, pixels."""
-
-    pictures: Image
-    coords: NDArray[np.float16]
-    rotations: Array
-    intrinsics: Array
-
-    @classmethod
-    def of(
-        cls, model: ObjectModel, renderer: Renderer, config: QueryConfig = QueryConfig(), rng: Rng | None = None,
-        around: Sequence[QueryScene] = (),
-    ) -> ViewBank:  # fmt: skip
-        """rng: where given, a share of the banks has wrong colours or none. around: where given (with rng), only
-        config.drawn of the directions are drawn, those nearest to the scenes' first."""
-        look = recoloured(model, rng) if rng is not None and rng.random() < config.plain else model
-        directions = fibonacci_sphere(config.views)
-        if rng is not None and len(around):
-            directions = directions[_near_directions(directions, around, config, rng)]
-        rotations = np.stack([view_rotation(d) for d in directions])
-        outline = (model.outline - model.center) / model.diameter
-        inside = np.stack([_fitted(R, outline) for R in rotations])
-        cameras = [Camera(f, f, cx, cy, VIEW, VIEW) for f, cx, cy in inside]
-        place = np.array([0.0, 0.0, DISTANCE * model.diameter])
-        poses = [Pose(R, place) @ model.T_obj_ctr.inverse() for R in rotations]
-        drawn = renderer.render(look, poses, cameras, light=HEADLIGHT)
-        masks = np.stack([np.asarray(v.mask) for v in drawn])
-        coords = (np.stack([np.asarray(v.coords) for v in drawn]) - model.center) / model.diameter
-        pictures = np.concatenate([np.stack([v.image for v in drawn]), masks[..., None] * np.uint8(255)], axis=3)
-        return cls(pictures, (coords * masks[..., None]).astype(np.float16), rotations, inside)
-
-    @property
-    def template_rotations(self) -> Array:
-        """(M * TURNS, 3, 3)."""
-        turns = np.stack([np.linalg.matrix_power(_QUARTER, k) for k in range(TURNS)])
-        return (turns[None] @ self.rotations[:, None]).reshape(-1, 3, 3)
-
-    def templates(self, index: NDArray[np.int64] | None = None) -> Image:
-        """Pictures uint8 (K, 64, 64, 4) of templates ``index`` (K,); of all where not given."""
-        every = np.arange(len(self.pictures) * TURNS) if index is None else index
-        return np.stack([np.rot90(self.pictures[i // TURNS], i % TURNS) for i in every])
-
-    def template_coords(self, index: int) -> NDArray[np.float32]:
-        """(64, 64, 3), the points seen in a template; zero where there is none."""
-        return np.rot90(self.coords[index // TURNS], index % TURNS).astype(np.float32)
-
-    def template_camera(self, index: int) -> Camera:
-        f, cx, cy = self.intrinsics[index // TURNS]
-        for _ in range(index % TURNS):
-            cx, cy = cy, VIEW - 1 - cx
-        return Camera(f, f, cx, cy, VIEW, VIEW)
-
-    def locate(self, points: Array, index: int, tolerance: float) -> tuple[Array, NDArray[np.bool_]]:
-        """Where points (N, 3) lie in a template, pixels (N, 2), and whether they are seen there (N,)."""
-        camera = self.template_camera(index)
-        R = np.linalg.matrix_power(_QUARTER, index % TURNS) @ self.rotations[index // TURNS]
-        pixels = camera.project(points @ R.T + [0.0, 0.0, DISTANCE])
-        near = np.rint(pixels).astype(int)
-        inside = ((near >= 0) & (near < VIEW)).all(1)
-        u, v = near.clip(0, VIEW - 1).T
-        on = np.rot90(self.pictures[index // TURNS, ..., 3], index % TURNS)[v, u] > 0
-        there = np.rot90(self.coords[index // TURNS], index % TURNS)[v, u].astype(np.float32)
-        return pixels, inside & on & (np.linalg.norm(there - points, axis=1) < tolerance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,15 +120,6 @@ def _near_directions(
     wanted = np.argsort(-facing, axis=1)[:, :2].T.ravel()
     order = list(dict.fromkeys([int(i) for i in wanted] + [int(i) for i in rng.permutation(len(directions))]))
     return np.array(order[: config.drawn], dtype=np.int64)
-
-
-def _fitted(R: Array, outline: Array) -> Array:
-    """Focal length and principal point (3,) with which the points fill a view's picture."""
-    points = outline @ R.T + [0.0, 0.0, DISTANCE]
-    uv = points[:, :2] / points[:, 2:]
-    low, high = uv.min(0), uv.max(0)
-    f = FILL * VIEW / max(float((high - low).max()), 0.25 / DISTANCE)
-    return np.array([f, *(0.5 * (VIEW - 1) - f * 0.5 * (low + high))])
 
 
 def recoloured(model: ObjectModel, rng: Rng) -> ObjectModel:
