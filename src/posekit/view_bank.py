@@ -80,17 +80,23 @@ class ViewBank:
             cx, cy = cy, VIEW - 1 - cx
         return Camera(f, f, cx, cy, VIEW, VIEW)
 
-    def locate(self, points: Array, index: int, tolerance: float) -> tuple[Array, NDArray[np.bool_]]:
-        """Where points (N, 3) lie in a template, pixels (N, 2), and whether they are seen there (N,)."""
-        camera = self.template_camera(index)
-        R = np.linalg.matrix_power(_QUARTER, index % TURNS) @ self.rotations[index // TURNS]
-        pixels = camera.project(points @ R.T + [0.0, 0.0, DISTANCE])
+    def locate(self, points: Array, index: NDArray[np.int64], tolerance: float) -> tuple[Array, NDArray[np.bool_]]:
+        """Where points (N, 3) lie in templates ``index`` (k,), pixels (k, N, 2), and whether they are seen there,
+        (k, N): whether the surface there is nearer to them than ``tolerance``."""
+        view, turn = index // TURNS, index % TURNS
+        seen_from = points @ self.rotations[view].transpose(0, 2, 1) + [0.0, 0.0, DISTANCE]
+        f, c = self.intrinsics[view, None, :1], self.intrinsics[view, None, 1:]
+        pixels = seen_from[..., :2] / seen_from[..., 2:] * f + c
         near = np.rint(pixels).astype(int)
-        inside = ((near >= 0) & (near < VIEW)).all(1)
-        u, v = near.clip(0, VIEW - 1).T
-        on = np.rot90(self.pictures[index // TURNS, ..., 3], index % TURNS)[v, u] > 0
-        there = np.rot90(self.coords[index // TURNS], index % TURNS)[v, u].astype(np.float32)
-        return pixels, inside & on & (np.linalg.norm(there - points, axis=1) < tolerance)
+        inside = ((near >= 0) & (near < VIEW)).all(2)
+        u, v = near[..., 0].clip(0, VIEW - 1), near[..., 1].clip(0, VIEW - 1)
+        on = self.pictures[view[:, None], v, u, 3] > 0
+        away = self.coords[view[:, None], v, u].astype(np.float64) - points
+        seen = inside & on & ((away * away).sum(2) < tolerance * tolerance)
+        for k in range(1, TURNS):
+            rows = turn >= k  # a quarter more for these
+            pixels[rows] = np.stack([pixels[rows, :, 1], VIEW - 1 - pixels[rows, :, 0]], axis=2)
+        return pixels, seen
 
 
 def _fitted(R: Array, outline: Array) -> Array:

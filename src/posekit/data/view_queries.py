@@ -20,7 +20,7 @@ from posekit.camera import Box, Camera
 from posekit.data.augment import AugmentConfig, observe
 from posekit.data.pairs import random_light
 from posekit.data.procedural import random_colour
-from posekit.geometry import Pose, random_rotation, rotation_between
+from posekit.geometry import Pose, fibonacci_sphere, random_rotation, rotation_between
 from posekit.nets.mvnet import CELL, GRID, NONE
 from posekit.object_model import ObjectModel
 from posekit.render import Renderer
@@ -110,6 +110,20 @@ class QueryGroup:
 
     views: Image
     samples: list[QuerySample]
+
+
+def training_bank(
+    model: ObjectModel, renderer: Renderer, config: QueryConfig, rng: Rng, around: Sequence[QueryScene] = ()
+) -> ViewBank:
+    """A bank for `draw_queries`; a share of them has wrong colours or none.
+
+    around: where given, only config.drawn of the directions are drawn, those nearest to the scenes' first.
+    """
+    look = recoloured(model, rng) if rng.random() < config.plain else model
+    directions = fibonacci_sphere(config.views)
+    if len(around):
+        directions = directions[_near_directions(directions, around, config, rng)]
+    return ViewBank.of(model, renderer, directions, look)
 
 
 def _near_directions(
@@ -298,12 +312,11 @@ def match_targets(
     points = coords.reshape(-1, 3)[which].astype(np.float64)
     cell = np.full((len(templates), visible.size), NONE, np.int64)
     offset = np.zeros((len(templates), 2, visible.size), np.float32)
-    for row, index in enumerate(templates):
-        pixels, seen = bank.locate(points, int(index), tolerance)
-        place = ((pixels[seen] + 0.5) / CELL).clip(0, GRID - 1e-6)
-        at = np.floor(place).astype(np.int64)
-        cell[row, which[seen]] = at[:, 1] * GRID + at[:, 0]
-        offset[row][:, which[seen]] = (place - at - 0.5).T
+    pixels, seen = bank.locate(points, templates, tolerance)
+    place = ((pixels + 0.5) / CELL).clip(0, GRID - 1e-6)
+    at = np.floor(place).astype(np.int64)
+    cell[:, which] = np.where(seen, at[..., 1] * GRID + at[..., 0], NONE)
+    offset[:, :, which] = np.where(seen[..., None], place - at - 0.5, 0.0).transpose(0, 2, 1)
     return cell, offset
 
 
