@@ -28,13 +28,15 @@ FArray = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class MatchingOptions:
-    """enlarge: the crop's size in boxes, as in training. likely: least probability of a correspondence. error_px: how
-    far off an inlier may be, in pixels of the crop. inliers: fewest that make a pose. pooled: best views whose
-    correspondences are also solved together. apart: least angle between two hypotheses. refine: the last solve."""
+    """enlarge: the crop's size in boxes, as in training. likely: least probability of a correspondence; present: that
+    a cell of the crop is in a view at all. error_px: how far off an inlier may be, in pixels of the crop. inliers:
+    fewest that make a pose. pooled: best views whose correspondences are also solved together. apart: least angle
+    between two hypotheses. refine: the last solve."""
 
     enlarge: float = 1.35
-    likely: float = 0.2
-    error_px: float = 4.0
+    likely: float = 0.08
+    present: float = 0.4
+    error_px: float = 6.0
     inliers: int = 8
     pooled: int = 3
     apart: float = float(np.deg2rad(15.0))
@@ -154,7 +156,8 @@ class MatchingSearch:
         place = (np.stack([cell % GRID, cell // GRID], axis=1) + 0.5 + offset) * CELL - 0.5
         u, v = np.rint(place).astype(int).clip(0, VIEW - 1).T
         points = self.bank.template_coords(int(answer.templates[row]))[v, u].astype(np.float64)
-        kept = (weight > self.options.likely) & (np.abs(points).sum(1) > 0)
+        there = 1.0 - share[:, NONE] > self.options.present
+        kept = there & (weight > self.options.likely) & (np.abs(points).sum(1) > 0)
         columns = self.mvnet.columns
         home = np.arange(len(cell))
         pixels = np.stack([home % columns, home // columns], axis=1) * CELL + 0.5 * (CELL - 1)

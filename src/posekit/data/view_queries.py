@@ -235,12 +235,12 @@ def draw_queries(
 ) -> QueryGroup:
     """A group of config.queries queries for one mesh.
 
-    scenes: of the bank's object, at least one. others: RGBA crops of other objects, for clutter and occluders.
-    negatives_from: scenes of other objects, which the mesh is not; where there are none, all queries without the mesh
-    are empty of objects but clutter.
+    scenes: of the bank's object; where there are none, no query shows it. others: RGBA crops of other objects, for
+    clutter and occluders. negatives_from: scenes of other objects, which the mesh is not; where there are none, queries
+    without the mesh show clutter at most.
     """
     R_templates = bank.template_rotations
-    shown = [None if rng.random() < config.absent else scenes[int(rng.integers(len(scenes)))]
+    shown = [None if not len(scenes) or rng.random() < config.absent else scenes[int(rng.integers(len(scenes)))]
              for _ in range(config.queries)]  # fmt: skip
     relations = [None if s is None else Relation.of(s.R, R_templates, config) for s in shown]
     group = _group([r.near for r in relations if r is not None], len(R_templates), config, rng)

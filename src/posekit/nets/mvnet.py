@@ -198,7 +198,8 @@ class MatchingMVNet(nn.Module):
         self.leave, self.view_leave = nn.LayerNorm(channels), nn.LayerNorm(channels)
         self.match, self.view_match = nn.Linear(channels, channels), nn.Linear(channels, channels)
         self.none = nn.Linear(channels, channels)
-        self.offset = nn.Sequential(nn.Linear(2 * channels, inner), nn.ReLU(), nn.Linear(inner, 2))
+        self.here, self.there = nn.Linear(channels, inner), nn.Linear(channels, inner)
+        self.offset = nn.Linear(inner, 2)
         self.silhouettes = Silhouettes(fine, channels)
         self.judge = nn.Sequential(nn.Linear(2 * channels, channels), nn.ReLU(), nn.Linear(channels, 3))
         self.presence = nn.Sequential(nn.Linear(4 * channels, channels), nn.ReLU(), nn.Linear(channels, 1))
@@ -244,7 +245,7 @@ class MatchingMVNet(nn.Module):
         query = self.match(crop)[:, None] * crop.shape[2] ** -0.5
         cells = (query @ keys.transpose(2, 3)).float()
         share = torch.softmax(cells[..., :NONE], dim=3).to(tokens.dtype)
-        pair = torch.cat([crop[:, None].expand(-1, k, -1, -1), share @ tokens], dim=3)
+        pair = F.relu(self.here(crop)[:, None] + share @ self.there(tokens))
         offsets = self.offset(pair).float().transpose(2, 3).unflatten(3, (self.rows, self.columns))
         judged = self.judge(pooled).float()
         whole = torch.cat([crop.mean(1), crop.amax(1), pooled.amax(1)], dim=1)
