@@ -17,7 +17,19 @@ LAYERS = {
     0: {"geometry", "camera", "files"},
     1: {"view", "object_model", "results"},
     2: {"load", "zoom", "metrics", "pnp", "fusion", "render", "nets", "detect", "draw"},
-    3: {"data", "refine", "hypotheses", "figures", "odometry", "video", "contour", "region", "recording"},
+    3: {
+        "data",
+        "refine",
+        "hypotheses",
+        "figures",
+        "odometry",
+        "video",
+        "contour",
+        "region",
+        "recording",
+        "view_bank",
+        "mvnet_search",
+    },
     4: {"estimate", "novel"},
     5: {"search", "track", "evaluate", "train"},
     6: {"cli"},
@@ -27,6 +39,8 @@ ANYWHERE = {"errors", "_version"}
 # Fusion weighs what PnP alone solves. A camera turns rays; tracking and the search for instances are measured too.
 SIBLINGS = {("camera", "geometry"), ("fusion", "pnp"), ("evaluate", "track"), ("evaluate", "search")}
 SIBLINGS |= {("odometry", "region")}  # a look keeps its outline
+# MV-Net is trained and used with the same views; its search is one of several that give first poses.
+SIBLINGS |= {("data", "view_bank"), ("mvnet_search", "view_bank"), ("mvnet_search", "hypotheses")}
 
 # A foreign library and the rooms whose door it is.
 DOORS = {
