@@ -13,7 +13,7 @@ import itertools
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -28,16 +28,27 @@ from posekit.data.augment import AugmentConfig, Sample, augment
 from posekit.data.pairs import Pair, PairConfig, render_pairs
 from posekit.data.procedural import random_object
 from posekit.data.scenes import SceneConfig
+from posekit.data.view_queries import (
+    QueryConfig,
+    QueryGroup,
+    QueryScene,
+    collate_queries,
+    draw_queries,
+    render_queries,
+    training_bank,
+)
 from posekit.errors import ConfigError
 from posekit.object_model import ObjectModel
 from posekit.render import Renderer
+from posekit.view_bank import ViewBank
 
 Image = NDArray[np.uint8]
 Batch = dict[str, Tensor]
 T = TypeVar("T")
 
 # What a generator is for, the second number of its seed
-OBJECTS, PAIRS, SCENES, BATCHES = range(4)
+OBJECTS, PAIRS, SCENES, BATCHES, QUERIES = range(5)
+QUERIED = 12  # meshes that a shard keeps for MV-Net's queries
 
 
 @dataclass(frozen=True)
@@ -45,8 +56,8 @@ class StreamConfig:
     """batch: pairs in a process's batch. shard: pairs drawn from one pool at most; the greatest common divisor with
     the batch counts. pool: pairs kept for a batch, over all its shards. reuse: how often a pair is used, with fresh
     augmentation. per_object: pairs rendered of one object at a time. serves: how often an object is rendered.
-    mvnet: MV-Net's samples in a batch, a multiple of the number of shards; 0 = none. share: share of the user's
-    meshes where procedural ones are wanted too."""
+    mvnet: MV-Net's queries in a batch, a multiple of the number of shards; 0 = none. share: share of the user's meshes
+    where procedural ones are wanted too."""
 
     batch: int = 32
     shard: int = 8
@@ -58,6 +69,7 @@ class StreamConfig:
     share: float = 1.0
     pairs: PairConfig = PairConfig()
     scenes: SceneConfig = SceneConfig()
+    queries: QueryConfig = QueryConfig()
     augment: AugmentConfig = AugmentConfig()
 
     def __post_init__(self) -> None:
@@ -145,10 +157,29 @@ class _Shard:
         self.stream, self.config, self.shard, self.renderer = stream, stream.config, shard, renderer
         self.source = Source(stream, lane, shard)
         self.pairs = window(self._pairs, self.config, self.config.batch // self.config.shards)
+        self.for_queries = Source(stream, lane, shard)
+        self.queries = replace(self.config.queries, queries=self.config.mvnet // self.config.shards)
+        per_batch = self.queries.queries / self.config.reuse / self.config.per_object
+        self.meshes = Window(self._mesh, QUERIED // 4, QUERIED, per_batch)
 
     def _pairs(self, block: int) -> list[Pair]:
         model, rng = self.source.object(PAIRS, block), self.source.rng(PAIRS, block)
         return render_pairs(self.renderer, model, self.config.per_object, self.config.pairs, rng, self.stream.photos)
+
+    def _mesh(self, block: int) -> tuple[ViewBank, list[QueryScene]]:
+        model, rng = self.for_queries.object(SCENES, block), self.for_queries.rng(SCENES, block)
+        scenes = render_queries(self.renderer, model, self.config.per_object, self.queries, rng)
+        return training_bank(model, self.renderer, self.queries, rng, scenes), scenes
+
+    def draw_queries(self, k: int, lanes: int) -> QueryGroup:
+        """This shard's queries of batch k, of one mesh."""
+        rng = np.random.default_rng([self.stream.seed, QUERIES, k, self.shard])
+        meshes = self.meshes.at(k // lanes)
+        chosen = int(rng.integers(len(meshes)))
+        bank, scenes = meshes[chosen]
+        strange = [scene for n, (_, found) in enumerate(meshes) if n != chosen for scene in found]
+        others = [scene.rgba for scene in [*scenes, *strange]]
+        return draw_queries(bank, scenes, others, self.stream.photos, self.queries, rng, strange, self.config.augment)
 
     def draw(self, k: int, lanes: int) -> list[Sample]:
         """This shard of batch k."""
@@ -160,7 +191,7 @@ class _Shard:
 
 
 class PairStream(IterableDataset[Batch]):
-    """Batches for the lite recipe, as dictionaries of tensors: `collate`'s.
+    """Batches for the lite recipe, as dictionaries of tensors: `collate`'s, and with ``mvnet`` `collate_queries`'.
 
     models: the objects to train on; none = procedural ones. start: the first batch's number. rank: the process's
     number, which says which shards it draws.
@@ -176,7 +207,10 @@ class PairStream(IterableDataset[Batch]):
         renderer, count = Renderer(), self.config.shards
         shards = [_Shard(self, first % lanes, self.rank * count + i, renderer) for i in range(count)]
         for k in itertools.count(first, lanes):
-            yield collate([sample for shard in shards for sample in shard.draw(k, lanes)])
+            batch = collate([sample for shard in shards for sample in shard.draw(k, lanes)])
+            if self.config.mvnet:
+                batch |= collate_queries([shard.draw_queries(k, lanes) for shard in shards])
+            yield batch
 
 
 def worker_lane(start: int) -> tuple[int, int]:

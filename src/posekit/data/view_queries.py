@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from posekit.camera import Box, Camera
-from posekit.data.augment import AugmentConfig, observe
+from posekit.data.augment import AugmentConfig, composed
 from posekit.data.pairs import random_light
 from posekit.data.procedural import random_colour
 from posekit.geometry import Pose, fibonacci_sphere, random_rotation, rotation_between
@@ -272,7 +272,7 @@ def _present(
     augment: AugmentConfig,
     rng: Rng,
 ) -> QuerySample:
-    picture, hidden = observe(scene.rgba, *surroundings, augment, rng)
+    picture, hidden = composed(scene.rgba, *surroundings, augment, rng)
     near = relation.near[group]
     first = np.argsort(-near)
     rest = rng.permutation(first[config.nearest :])[: config.kept - config.nearest]
@@ -282,7 +282,7 @@ def _present(
     amodal = scene.amodal
     silhouettes = np.stack([amodal & ~_shrunk(hidden, amodal.shape), amodal])
     which = group[chosen]
-    return QuerySample(picture[..., :3], chosen, cell, offset, relation.turn[which].astype(np.float32),
+    return QuerySample(picture, chosen, cell, offset, relation.turn[which].astype(np.float32),
                        relation.facing[which].astype(np.float32), near[chosen].astype(np.float32),
                        near.astype(np.float32), silhouettes, 1.0)  # fmt: skip
 
@@ -293,10 +293,10 @@ def _absent(scenes: Sequence[QueryScene], others: Sequence[Image], photos: Seque
     rgba = np.zeros((H, W, 4), np.uint8)
     if len(scenes) and rng.random() >= config.empty:
         rgba = scenes[int(rng.integers(len(scenes)))].rgba
-    picture, _ = observe(rgba, others, photos, augment, rng)
+    picture, _ = composed(rgba, others, photos, augment, rng)
     k, n = config.kept, config.cells[0] * config.cells[1]
     zero = np.zeros(k, np.float32)
-    return QuerySample(picture[..., :3], rng.permutation(config.templates)[:k].astype(np.int64),
+    return QuerySample(picture, rng.permutation(config.templates)[:k].astype(np.int64),
                        np.full((k, n), NONE, np.int64), np.zeros((k, 2, n), np.float32), np.zeros((k, 2), np.float32),
                        zero, zero, np.zeros(config.templates, np.float32), np.zeros((2, H // 4, W // 4), bool),
                        0.0)  # fmt: skip

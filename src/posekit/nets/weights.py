@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from posekit.errors import WeightsError
 from posekit.files import write_bytes_atomic, write_text_atomic
 from posekit.nets.lite import LiteConfig, LiteSVNet
+from posekit.nets.mvnet import MatchingMVNet
 from posekit.nets.paper import Branch, PaperMVNet, PaperSVNet
 
 PRESETS = ("lite", "paper")
@@ -42,7 +43,7 @@ class Networks:
     preset: str
     config: LiteConfig | PaperConfig
     svnet: LiteSVNet | PaperSVNet
-    mvnet: PaperMVNet | None
+    mvnet: MatchingMVNet | PaperMVNet | None
     digest: str = "untrained"
     about: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
@@ -61,7 +62,7 @@ def build(preset: str, config: LiteConfig | PaperConfig | None = None) -> Networ
     if preset == "lite":
         lite = config if isinstance(config, LiteConfig) else LiteConfig()
         svnet = LiteSVNet(lite)
-        return Networks(preset, lite, svnet, None)
+        return Networks(preset, lite, svnet, MatchingMVNet(svnet.tower, lite))
     if preset == "paper":
         paper = config if isinstance(config, PaperConfig) else PaperConfig()
         branch = Branch(paper.size, paper.width)

@@ -12,6 +12,8 @@ from posekit.data.stream import Batch, PairStream
 from posekit.nets.inputs import images_to_tensor
 from posekit.nets.lite import LiteSVNet
 from posekit.nets.losses import DenseLossConfig, Target, dense_loss
+from posekit.nets.mvnet import rgb_input, view_input
+from posekit.nets.mvnet_loss import mvnet_loss
 from posekit.nets.weights import Networks
 from posekit.train.config import TrainConfig
 from posekit.train.sources import Sources
@@ -36,8 +38,15 @@ class LiteModule(nn.Module):
             batch["relief"].float(),
             batch["focal"],
         )
+        matched = None
+        if "mvnet" in self.nets:
+            observed, views = rgb_input(batch["mv_observed"]), view_input(batch["mv_views"])
+            matched = self.nets["mvnet"](observed, views, batch["mv_object"], batch["mv_chosen"])
         with torch.autocast(batch["flow"].device.type, enabled=False):
             loss, parts = dense_loss(output, svnet.heads, target_of(batch), self.config)
+            if matched is not None:
+                added, more = mvnet_loss(matched, batch)
+                loss, parts = loss + self.config.mvnet * added, parts | {f"mv_{k}": v for k, v in more.items()}
         return loss, parts
 
 

@@ -304,8 +304,7 @@ class Trainer:
         self.optimiser.step()
         self.average.update_parameters(self.task.nets)
         self.step += 1
-        extra = {k: torch.tensor(v) for k, v in (also or {}).items()} if not self.on_gpu else {}
-        found = {"loss": loss.detach(), **parts, "norm": norm.detach(), **extra}
+        found = {"loss": loss.detach(), **parts, "norm": norm.detach(), **(also or {})}
         values = {k: torch.as_tensor(v, dtype=torch.float32, device=loss.device) for k, v in found.items()}
         self.running.update(values)
         return values
@@ -446,7 +445,7 @@ def loader(stream: IterableDataset[Batch], workers: int, on_gpu: bool = False) -
     make no batch for some minutes.
     """
     context = ("forkserver" if on_gpu else "fork") if workers else None
-    wait = (60 if on_gpu else 600) if workers else 0
+    wait = (120 if on_gpu else 600) if workers else 0
     batches = DataLoader(
         stream,
         batch_size=None,

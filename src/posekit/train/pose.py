@@ -18,7 +18,8 @@ from posekit.data.procedural import random_object
 from posekit.data.scene_stream import Catalogue
 from posekit.errors import ConfigError, OutputError, WeightsError
 from posekit.files import write_text_atomic
-from posekit.nets.lite import LiteSVNet
+from posekit.nets.lite import LiteConfig, LiteSVNet
+from posekit.nets.mvnet import MatchingMVNet
 from posekit.nets.weights import Networks, build, load_networks, save_networks
 from posekit.render import Renderer
 from posekit.train.calibrate import SEED, calibrate
@@ -121,6 +122,7 @@ def fitted(config: TrainConfig, size: tuple[int, int]) -> TrainConfig:
         stream,
         pairs=dataclasses.replace(stream.pairs, size=size),
         scenes=dataclasses.replace(stream.scenes, crop=size),
+        queries=dataclasses.replace(stream.queries, crop=size),
         augment=dataclasses.replace(stream.augment, dilate=dilate),
     )
     return dataclasses.replace(config, stream=stream)
@@ -158,7 +160,8 @@ def make_networks(config: TrainConfig) -> tuple[Networks, frozenset[str]]:
     if networks.mvnet is not None:
         return networks, frozenset()
     if isinstance(networks.svnet, LiteSVNet):
-        return networks, frozenset()
+        assert isinstance(networks.config, LiteConfig)
+        return dataclasses.replace(networks, mvnet=MatchingMVNet(networks.svnet.tower, networks.config)), frozenset()
     raise WeightsError(f"the weights {init} hold no MV-Net, which the paper recipe trains too: start without --init.")
 
 
