@@ -40,7 +40,7 @@ class PairConfig:
     noise: PoseNoise = PoseNoise()
     small: float = 0.35
     wide: float = 0.22
-    widest: float = 2.2
+    widest: float = 1.8
     lost: float = 0.12
     flipped: float = 0.5
     enlarge: tuple[float, float] = (1.25, 1.6)
