@@ -23,6 +23,7 @@ CLUSTERS = 24  # colours that are told apart
 QUIET = 6.0  # grey values: a spread of colours below which they say little
 FAINT, CLEAR = 8.0, 2.0  # grey values added to a picture's mean gradient; multiples of the sum that count at most
 LEVELS = 32.0  # steps of a normalised colour, kept as an int8
+LEARNED = 2000  # pixels from which a palette is learned, about
 BLOCK = 512  # silhouettes compared at a time
 
 
@@ -42,6 +43,7 @@ class Palette:
     def __init__(self, image: Image, shown: Mask) -> None:
         """image: RGB (H, W, 3). shown: (H, W), the pixels that count; at least one."""
         values = _lab(image)[shown]
+        values = values[:: max(1, len(values) // LEARNED)]
         count = min(CLUSTERS, len(values))
         cv2.setRNGSeed(0)
         criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 8, 0.5)

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from posekit.camera import Camera, Zoom
+from posekit.camera import Box, Camera, Zoom
 from posekit.errors import PromptError, WeightsError
 from posekit.evidence import Palette, Picture, Silhouettes, Weights
 from posekit.geometry import (
@@ -36,12 +36,13 @@ from posekit.object_model import ObjectModel
 from posekit.render import Light, Renderer
 from posekit.results import Detection
 from posekit.view import View
-from posekit.zoom import box_window, frontal_camera, frontal_pose, zoom_to_box, zoom_to_pose
+from posekit.zoom import box_window, frontal_camera, frontal_pose, zoom_to_box
 
 Array = NDArray[np.float64]
 FArray = NDArray[np.float32]
 
 TEMPLATE = 64  # side of the box search's templates, pixels
+JUDGED = 96  # side of the window in which poses are judged, pixels
 FINER = 2  # times as fine as it is compared, a crop is kept
 FLAT = 20.0  # a gradient below which brightness says little, in Sobel's units of 8 bits
 
@@ -353,6 +354,27 @@ class BoxSearch:
         return Pose.rotation(crop.R_view_cam.T) @ T_view_ctr @ self.model.T_obj_ctr.inverse()
 
 
+class Judge:
+    """Evidence for rendered poses in one window of a photograph, so that poses can be compared with each other."""
+
+    def __init__(self, view: View, box: Box, model: ObjectModel, renderer: Renderer, weights: Weights = Weights()):
+        """view: the photograph; its mask, where there is one, counts too. box: edges, round what the poses show."""
+        self.model, self.renderer, self.weights = model, renderer, weights
+        self.zoom = box_window(view.camera, box, JUDGED, BoxOptions.root / BoxOptions.side)
+        crop, shown = view.zoomed(self.zoom), shown_in(view, self.zoom)
+        self.picture = Picture.of(crop.image, shown, Palette(crop.image, shown), crop.mask) if shown.any() else None
+
+    def scores(self, poses: Sequence[Pose]) -> list[float]:
+        """Of each ``T_cam_obj``, as `Silhouettes.scores`; 0 for one that shows nothing in the window."""
+        if self.picture is None or not poses:
+            return [0.0] * len(poses)
+        turned = [Pose.rotation(self.zoom.R_view_cam) @ pose for pose in poses]
+        drawn = self.renderer.render(self.model, turned, self.zoom.camera, coords=False)
+        masks = [np.asarray(each.mask, np.bool_) for each in drawn]
+        scores = Silhouettes.of(masks, [each.image for each in drawn]).scores(self.picture, self.weights)
+        return [float(score) if mask.any() else 0.0 for score, mask in zip(scores, masks, strict=True)]
+
+
 class MVNetSearch:
     """The paper's first pose: MV-Net compares the crop with the six views of a cube's faces (section 3.2).
 
@@ -417,17 +439,6 @@ class Agreement:
     silhouette: float
     colour: float
     structure: float = 0.0
-
-
-def agreements(
-    view: View, model: ObjectModel, poses: Sequence[Pose], renderer: Renderer, size: tuple[int, int]
-) -> list[Agreement]:
-    """Render each ``T_cam_obj`` in a zoomed view of ``size`` (width, height), and compare."""
-    outline = model.outline - model.center
-    zooms = [zoom_to_pose(view.camera, T @ model.T_obj_ctr, outline, size) for T in poses]
-    turned = [Pose.rotation(zoom.R_view_cam) @ T for zoom, T in zip(zooms, poses, strict=True)]
-    drawn = renderer.render(model, turned, [z.camera for z in zooms], coords=False)
-    return [agreement_of(view.zoomed(zoom), d) for zoom, d in zip(zooms, drawn, strict=True)]
 
 
 def agreement_of(observed: View, rendered: View) -> Agreement:

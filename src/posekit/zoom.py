@@ -52,7 +52,7 @@ def box_window(camera: Camera, box: Box, side: int, root: float) -> Zoom:
     side: pixels."""
     ray = camera.box_centre_ray(box)
     turned = camera.box_corner_rays(box) @ rotation_between(ray, [0.0, 0.0, 1.0]).T
-    width, height = np.ptp(turned[:, :2] / turned[:, 2:], axis=0)
+    width, height = np.ptp(turned[:, :2] / np.maximum(turned[:, 2:], 1e-6), axis=0)
     return Zoom.look_at(camera, ray, 0.5 * float(np.sqrt(width * height)) / root, (side, side))
 
 
