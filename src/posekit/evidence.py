@@ -109,6 +109,31 @@ class Silhouettes:
             starts,
         )
 
+    @classmethod
+    def joined(cls, parts: Sequence[Silhouettes]) -> Silhouettes:
+        """Those of all parts, in their order."""
+        counts = np.concatenate([np.diff(part.starts) for part in parts])
+        return cls(
+            np.concatenate([part.masks for part in parts]),
+            np.concatenate([part.colours for part in parts]),
+            np.concatenate([part.edges for part in parts]),
+            np.concatenate([part.normals for part in parts]),
+            np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        )
+
+    def turned(self) -> Silhouettes:
+        """All by a quarter turn clockwise. Their pictures must be square."""
+        side = round(self.masks.shape[1] ** 0.5)
+        square = (len(self), side, side)
+        rows, columns = np.divmod(self.edges, side)
+        return Silhouettes(
+            np.rot90(self.masks.reshape(square), -1, (1, 2)).reshape(len(self), -1),
+            np.rot90(self.colours.reshape(*square, 3), -1, (1, 2)).reshape(len(self), -1),
+            columns * side + side - 1 - rows,
+            np.stack([-self.normals[:, 1], self.normals[:, 0]], 1),
+            self.starts,
+        )
+
     def __len__(self) -> int:
         return len(self.masks)
 

@@ -8,7 +8,7 @@ are taken out. Nothing in it is learned.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -183,9 +183,10 @@ class TemplateSearch:
 
 @dataclass(frozen=True)
 class BoxOptions:
-    """views: directions over the sphere. turns: in-plane rotations. side: of the compared pictures, pixels; root:
-    square root of the box's area in them. aspect: factor by which a silhouette's aspect may differ from the box's.
-    tried: silhouettes that are moved. apart: least angle between two hypotheses. weights: of the evidence."""
+    """views: directions over the sphere. turns: in-plane rotations, a multiple of 4. side: of the compared pictures,
+    pixels; root: square root of the box's area in them. aspect: factor by which a silhouette's aspect may differ from
+    the box's. tried: silhouettes that are moved. apart: least angle between two hypotheses. weights: of the evidence.
+    """
 
     views: int = 200
     turns: int = 24
@@ -225,6 +226,11 @@ class _Placed:
     scale: float
     offset: Array
 
+    def turned(self) -> _Placed:
+        """By a quarter turn clockwise."""
+        offset = np.array([-self.offset[1], self.offset[0]])
+        return _Placed(self.view, self.turn + 0.5 * np.pi, 1 / self.aspect, self.scale, offset)
+
 
 MOVES = tuple(
     _Move(x, y, scale, turn)
@@ -245,20 +251,24 @@ class BoxSearch:
 
     def __init__(self, model: ObjectModel, renderer: Renderer, options: BoxOptions = BoxOptions()) -> None:
         """Raises PromptError where the mesh leaves no silhouette."""
-        self.model, self.options = model, options
+        self.model, self.options, self.weights = model, options, weights_for(model, options.weights)
         self.rotations = [view_rotation(d) for d in fibonacci_sphere(options.views)]
         self.distance = 4.0 * model.diameter
         focal = 0.9 * TEMPLATE * self.distance / model.diameter
         self.camera = Camera(focal, focal, 0.5 * TEMPLATE - 0.5, 0.5 * TEMPLATE - 0.5, TEMPLATE, TEMPLATE)
         poses = [Pose(R, np.array([0, 0, self.distance])) @ model.T_obj_ctr.inverse() for R in self.rotations]
         views = renderer.render(model, poses, self.camera, light=Light(), coords=False)
-        turns = np.arange(options.turns) * (2 * np.pi / options.turns)
+        turns = np.arange(options.turns // 4) * (2 * np.pi / options.turns)
         found = [self._place(k, view, turn) for k, view in enumerate(views) for turn in turns]
         usable = [each for each in found if each is not None]
         if not usable:
             raise PromptError(f"{model.name} leaves no silhouette from any side: its surface is too thin to search.")
         self.placed = [placed for placed, _, _ in usable]
-        self.silhouettes = Silhouettes.of([mask for _, mask, _ in usable], [image for _, _, image in usable])
+        quarters = [Silhouettes.of([mask for _, mask, _ in usable], [image for _, _, image in usable])]
+        for _ in range(3):
+            quarters.append(quarters[-1].turned())
+            self.placed += [placed.turned() for placed in self.placed[-len(usable) :]]
+        self.silhouettes = Silhouettes.joined(quarters)
         self.aspects = np.array([placed.aspect for placed in self.placed])
 
     def search(self, view: View, detection: Detection, count: int) -> list[Hypothesis]:
@@ -277,7 +287,7 @@ class BoxSearch:
         different = np.abs(np.log(self.aspects * size[1] / size[0]))
         rows = np.flatnonzero(different < max(np.log(self.options.aspect), different.min() + 1e-6))
         found = self.silhouettes.chosen(rows)
-        scores = found.scores(self._picture(crop, shown, palette, _Move()), self.options.weights)
+        scores = found.scores(self._picture(crop, shown, palette, _Move()), self.weights)
         best = rows[np.argsort(-scores, kind="stable")[: self.options.tried]]
         moves, scores = self._moved(crop, shown, palette, best)
         return self._apart(crop, best, moves, scores, count)
@@ -299,7 +309,7 @@ class BoxSearch:
     ) -> tuple[list[_Move], FArray]:
         """The best of MOVES for each of some silhouettes, and its score."""
         some = self.silhouettes.chosen(rows)
-        tried = [some.scores(self._picture(crop, shown, palette, move), self.options.weights) for move in MOVES]
+        tried = [some.scores(self._picture(crop, shown, palette, move), self.weights) for move in MOVES]
         table = np.stack(tried)
         best = table.argmax(0)
         return [MOVES[k] for k in best], np.asarray(table.max(0), np.float32)
@@ -359,7 +369,7 @@ class Judge:
 
     def __init__(self, view: View, box: Box, model: ObjectModel, renderer: Renderer, weights: Weights = Weights()):
         """view: the photograph; its mask, where there is one, counts too. box: edges, round what the poses show."""
-        self.model, self.renderer, self.weights = model, renderer, weights
+        self.model, self.renderer, self.weights = model, renderer, weights_for(model, weights)
         self.zoom = box_window(view.camera, box, JUDGED, BoxOptions.root / BoxOptions.side)
         crop, shown = view.zoomed(self.zoom), shown_in(view, self.zoom)
         self.picture = Picture.of(crop.image, shown, Palette(crop.image, shown), crop.mask) if shown.any() else None
@@ -471,6 +481,12 @@ def _gradients(image: NDArray[np.uint8]) -> FArray:
     """Sobel's, of the slightly blurred brightness, (H, W, 2)."""
     grey = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1.0)
     return np.dstack([cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)])
+
+
+def weights_for(model: ObjectModel, weights: Weights) -> Weights:
+    """Without the colour agreement for a mesh without colours: its shading depends on a light that nobody knows."""
+    plain = model.colors is None and model.texture is None
+    return replace(weights, agreement=0.0) if plain else weights
 
 
 def shown_in(view: View, zoom: Zoom) -> NDArray[np.bool_]:
