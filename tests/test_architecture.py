@@ -16,7 +16,7 @@ SOURCE = Path(__file__).resolve().parent.parent / "src" / "posekit"
 LAYERS = {
     0: {"geometry", "camera", "files"},
     1: {"view", "object_model", "results"},
-    2: {"load", "zoom", "metrics", "pnp", "fusion", "render", "nets", "detect", "draw"},
+    2: {"load", "zoom", "metrics", "pnp", "fusion", "render", "nets", "detect", "draw", "evidence"},
     3: {
         "data",
         "refine",

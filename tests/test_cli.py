@@ -169,7 +169,9 @@ def test_estimate_from_a_mask(invoke: Invoke, folder: Path) -> None:
     assert json.loads(result.stdout)["estimates"][0]["detection"]["source"] == "mask"
 
 
-@pytest.mark.parametrize(("mask_from", "source"), [("grabcut", "box+grabcut"), ("filled", "box+filled")])
+@pytest.mark.parametrize(
+    ("mask_from", "source"), [("none", "box"), ("grabcut", "box+grabcut"), ("filled", "box+filled")]
+)
 def test_estimate_says_where_the_mask_is_from(invoke: Invoke, mask_from: str, source: str) -> None:
     result = invoke("estimate", mask_from=mask_from, json="-")
     assert json.loads(result.stdout)["estimates"][0]["detection"]["source"] == source

@@ -30,12 +30,17 @@ def scene(colour: tuple[int, int, int] = (200, 60, 40)) -> tuple[View, np.ndarra
 
 def test_grabcut_finds_the_object_in_its_box() -> None:
     view, truth = scene()
-    detector: Detector = BoxPrompt(BOX)
+    detector: Detector = BoxPrompt(BOX, "grabcut")
     [detection] = detector.detect(view, [bracket()])
     assert detection.source == "box+grabcut"
     assert detection.box == BOX
     assert detection.mask is not None
     assert (detection.mask & truth).sum() / (detection.mask | truth).sum() > 0.95
+
+
+def test_a_box_alone_has_no_mask() -> None:
+    [detection] = BoxPrompt(BOX).detect(scene()[0], [bracket()])
+    assert detection.box == BOX and detection.mask is None and detection.source == "box"
 
 
 def test_grabcut_gives_the_same_mask_every_time() -> None:
@@ -47,14 +52,14 @@ def test_grabcut_gives_the_same_mask_every_time() -> None:
 
 def test_a_mask_that_cannot_be_right_is_refused() -> None:
     flat = View(np.full((150, 200, 3), 128, np.uint8), CAMERA)
-    [detection] = BoxPrompt(BOX).detect(flat, [bracket()])
+    [detection] = BoxPrompt(BOX, "grabcut").detect(flat, [bracket()])
     assert detection.source == "box+filled"
     np.testing.assert_array_equal(detection.mask, filled_mask(BOX, CAMERA))
 
 
 def test_a_box_of_the_whole_picture() -> None:
     view, _ = scene()
-    [detection] = BoxPrompt((0, 0, 200, 150)).detect(view, [bracket()])
+    [detection] = BoxPrompt((0, 0, 200, 150), "grabcut").detect(view, [bracket()])
     assert detection.mask is not None
     assert detection.mask.any()
 
@@ -62,7 +67,7 @@ def test_a_box_of_the_whole_picture() -> None:
 @pytest.mark.parametrize("box", [(10, 10, 11, 11), (199, 149, 200, 150), (0, 0, 1, 150), (3.4, 3.4, 5.1, 5.2)])
 def test_tiny_boxes_have_a_mask(box: tuple[float, float, float, float]) -> None:
     view, _ = scene()
-    [detection] = BoxPrompt(box).detect(view, [bracket()])
+    [detection] = BoxPrompt(box, "grabcut").detect(view, [bracket()])
     assert detection.mask is not None
     assert detection.mask.any()
 
@@ -101,7 +106,7 @@ def test_bad_boxes(box: tuple[float, float, float, float], words: str) -> None:
 
 
 def test_unknown_mask_source() -> None:
-    with pytest.raises(PromptError, match="grabcut, filled, not 'guess'"):
+    with pytest.raises(PromptError, match="none, grabcut, filled, not 'guess'"):
         BoxPrompt(BOX, mask_from="guess")
 
 

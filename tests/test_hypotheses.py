@@ -12,11 +12,12 @@ from objects import bracket
 from posekit.camera import Camera, mask_box
 from posekit.errors import WeightsError
 from posekit.geometry import Pose, random_rotation, rotation_angle, so3_exp
-from posekit.hypotheses import MVNetSearch, TemplateSearch, agreements
+from posekit.hypotheses import BoxSearch, Judge, MVNetSearch, TemplateSearch, agreement_of
 from posekit.nets.heads import Prediction
 from posekit.nets.lite import LiteConfig
 from posekit.nets.pose_delta import delta_between
 from posekit.nets.weights import build
+from posekit.refine import crops
 from posekit.render import Light, Renderer
 from posekit.results import Detection
 from posekit.view import View
@@ -60,6 +61,29 @@ def test_the_search_finds_the_pose_among_its_best(renderer: Renderer) -> None:
     assert np.median(depths) < 0.05 and np.median(sides) < 0.01
 
 
+def test_a_box_is_enough(renderer: Renderer) -> None:
+    """Boxes 5 % wrong, before a ground whose colours differ from the object's; a mask is not needed."""
+    model, rng = bracket(), np.random.default_rng(4)
+    search, near, depths = BoxSearch(model, renderer), [], []
+    for _ in range(8):
+        place = np.array([rng.uniform(-0.2, 0.2), rng.uniform(-0.15, 0.15), rng.uniform(0.5, 1.0)])
+        truth = Pose(random_rotation(rng), place) @ model.T_obj_ctr.inverse()
+        view, detection = seen(renderer, truth)
+        ground = rng.integers(90, 130, size=view.image.shape).astype(np.uint8)
+        view = View(np.where(detection.mask[..., None], view.image, ground), CAMERA)  # type: ignore[index]
+        size = np.array([detection.box[2] - detection.box[0], detection.box[3] - detection.box[1]] * 2)
+        wrong = tuple(float(v) for v in np.array(detection.box) + rng.uniform(-0.05, 0.05, 4) * size)
+        found = search.search(view, Detection(wrong), 5)  # type: ignore[arg-type]
+        for k, a in enumerate(found):
+            assert all(rotation_angle(a.T_cam_obj.R.T @ b.T_cam_obj.R) > search.options.apart for b in found[:k])
+        turn = [np.rad2deg(rotation_angle(h.T_cam_obj.R.T @ truth.R)) for h in found]
+        near.append(min(turn))
+        depths.append(abs((found[int(np.argmin(turn))].T_cam_obj @ model.T_obj_ctr).t[2] / place[2] - 1))
+    assert np.mean(np.array(near) < 25) >= 0.85 and np.median(depths) < 0.08
+    empty = dataclasses.replace(detection, mask=np.zeros((480, 640), bool))
+    assert search.search(view, empty, 5) == []
+
+
 def test_hypotheses_lie_apart_and_an_empty_mask_gives_none(renderer: Renderer) -> None:
     model = bracket()
     truth = Pose(np.eye(3), [0.0, 0.0, 0.7]) @ model.T_obj_ctr.inverse()
@@ -78,11 +102,16 @@ def test_agreement_is_best_at_the_truth(renderer: Renderer) -> None:
     view, detection = seen(renderer, truth)
     turned = Pose(truth.R @ so3_exp([0.3, 0.2, 0]), truth.t)
     away = Pose(truth.R, truth.t + [0.3, 0, 0])
-    best, worse, worst = agreements(view.with_mask(detection.mask), model, [truth, turned, away], renderer, (160, 120))
+    outline, poses = model.outline - model.center, [truth, turned, away]
+    looked = crops(view.with_mask(detection.mask), model, outline, poses, (160, 120), renderer)
+    best, worse, worst = map(agreement_of, *looked)
     assert best.silhouette > 0.93 and best.colour > 0.65
     assert best.silhouette > worse.silhouette > worst.silhouette == 0
     assert best.structure > 0.25 and best.structure > 1.5 * worse.structure and abs(worst.structure) < 0.05
-    assert agreements(view, model, [truth], renderer, (160, 120))[0].silhouette == 1.0, "without a mask"
+    [unmasked], [drawn] = crops(view, model, outline, [truth], (160, 120), renderer)
+    assert agreement_of(unmasked, drawn).silhouette == 1.0, "without a mask"
+    judged = Judge(view, detection.box, model, renderer).scores([truth, turned, away])
+    assert judged[0] > judged[1] > judged[2] == 0.0
 
 
 def test_mvnet_answers_relative_to_the_frontal_view(renderer: Renderer) -> None:

@@ -15,11 +15,11 @@ from posekit.errors import ConfigError
 from posekit.geometry import Pose
 from posekit.hypotheses import (
     Agreement,
+    BoxSearch,
     Hypothesis,
+    Judge,
     MVNetSearch,
-    TemplateSearch,
     agreement_of,
-    agreements,
     poses_beside,
 )
 from posekit.nets.predictor import NetworkPredictor
@@ -35,6 +35,7 @@ INITS = ("templates", "mvnet")
 SILHOUETTE, STRUCTURE, BLUR, BIAS = 4.1, 8.0, 3.0, -2.3  # of `presence`, fitted: docs/decisions/0014
 USUAL = 2.0  # pixels of the crop: the correspondences' expected error, where the network gives none
 FIRST, SEMIFINALISTS, HEATS, FINALISTS = 1, 4, 3, 2  # iterations after which only so many hypotheses go on
+DOUBT = 0.3  # evidence that outweighs a radian of predicted angle
 BESIDE = float(np.deg2rad(12.0))  # how far from a known pose others are tried
 
 
@@ -94,7 +95,7 @@ class PoseEstimator:
         self.networks = load_networks(preset, weights)
         self.predictor = NetworkPredictor(self.networks)
         self.renderer = Renderer()
-        self._search: TemplateSearch | MVNetSearch | None = None
+        self._search: BoxSearch | MVNetSearch | None = None
         if options.init == "mvnet":
             self._search = MVNetSearch(model, self.networks, self.renderer)
 
@@ -112,50 +113,51 @@ class PoseEstimator:
             searched = time.perf_counter()
             if not first:
                 continue
-            masked = view.with_mask(detection.mask) if detection.mask is not None else view.with_mask(None)
-            refined = self._refined(masked, [h.T_cam_obj for h in first], 0.5 * least)
+            masked = view.with_mask(detection.mask)
+            judge = Judge(masked, detection.box, self.model, self.renderer)
+            refined = self._refined(masked, judge, [h.T_cam_obj for h in first], 0.5 * least)
             done = time.perf_counter()
             timings = {"first_pose": searched - started, "refine": done - searched, "total": done - started}
-            estimates.append(self._choose(masked, refined, detection, timings))
+            estimates.append(self._choose(masked, judge, refined, detection, timings))
         return estimates
 
     def refine(self, view: View, T_cam_obj: Pose) -> Estimate:
         """Refine a known pose; view.mask, where there is one, helps. Where it does not converge within a few
         iterations, the four poses turned by 12 degrees towards a tetrahedron's corners compete with it."""
         started = time.perf_counter()
-        options = self.options.refine_options
+        options, judge = self.options.refine_options, self._judge_of(view, T_cam_obj)
         if self.options.beside and options.stop == "angle" and options.iterations > HEATS:
             heats = self._heats(view, [T_cam_obj])
             if not heats[0].converged:
                 heats += self._heats(view, poses_beside(T_cam_obj, self.model, BESIDE))
-            refined = self._finals(view, heats)
+            refined = self._finals(view, judge, heats)
         else:
             refined = refine(view, self.model, [T_cam_obj], self.predictor, self.renderer, options)
         seconds = time.perf_counter() - started
-        return self._choose(view, refined, None, {"refine": seconds, "total": seconds})
+        return self._choose(view, judge, refined, None, {"refine": seconds, "total": seconds})
 
-    def _refined(self, view: View, starts: Sequence[Pose], least: float) -> list[Refinement]:
+    def _refined(self, view: View, judge: Judge, starts: Sequence[Pose], least: float) -> list[Refinement]:
         """Every start for a few iterations, and the best of them to the end, unless its score is below ``least``."""
         options = self.options.refine_options
         if len(starts) <= FINALISTS or options.iterations <= HEATS:
             return refine(view, self.model, starts, self.predictor, self.renderer, options)
-        heats = self._best(view, self._on_outline(view, self._heats(view, starts, FIRST)), SEMIFINALISTS)
+        heats = self._best(judge, self._on_outline(view, self._heats(view, starts, FIRST)), SEMIFINALISTS)
         heats = self._on_outline(view, self._onward(view, heats, HEATS - FIRST))
-        if least > 0 and self._presence(view, self._best(view, heats, 1)[0].T_cam_obj) < least:
+        if least > 0 and self._presence(view, self._best(judge, heats, 1)[0].T_cam_obj) < least:
             return heats
-        return self._finals(view, heats)
+        return self._finals(view, judge, heats)
 
     def _heats(self, view: View, starts: Sequence[Pose], iterations: int = HEATS) -> list[Refinement]:
         short = replace(self.options.refine_options, iterations=iterations)
         return refine(view, self.model, starts, self.predictor, self.renderer, short)
 
-    def _finals(self, view: View, heats: Sequence[Refinement]) -> list[Refinement]:
+    def _finals(self, view: View, judge: Judge, heats: Sequence[Refinement]) -> list[Refinement]:
         """The best go on to the end."""
-        finalists = self._best(view, heats, FINALISTS)
+        finalists = self._best(judge, heats, FINALISTS)
         return self._onward(view, finalists, self.options.refine_options.iterations - HEATS)
 
-    def _best(self, view: View, heats: Sequence[Refinement], count: int) -> list[Refinement]:
-        order = np.argsort([-s for s in self._scores(view, heats)], kind="stable")
+    def _best(self, judge: Judge, heats: Sequence[Refinement], count: int) -> list[Refinement]:
+        order = np.argsort([-s for s in self._scores(judge, heats)], kind="stable")
         return [heats[k] for k in order[:count]]
 
     def _onward(self, view: View, heats: Sequence[Refinement], iterations: int) -> list[Refinement]:
@@ -169,7 +171,7 @@ class PoseEstimator:
     def first_poses(self, view: View, detection: Detection) -> list[Hypothesis]:
         """The first poses that ``options.init`` gives, best first; those for a detection's rough mask come last."""
         if self._search is None:
-            self._search = TemplateSearch(self.model, self.renderer)
+            self._search = BoxSearch(self.model, self.renderer)
         found: list[Hypothesis] = []
         for mask in (detection.mask, detection.rough):
             if mask is not None or not found:
@@ -178,10 +180,15 @@ class PoseEstimator:
         return found
 
     def _choose(
-        self, view: View, refined: Sequence[Refinement], detection: Detection | None, timings: dict[str, float]
+        self,
+        view: View,
+        judge: Judge,
+        refined: Sequence[Refinement],
+        detection: Detection | None,
+        timings: dict[str, float],
     ) -> Estimate:
-        """The hypothesis with the best score: a low predicted angle, and a silhouette that agrees with the mask."""
-        best = self._on_contour(view, refined[int(np.argmax(self._scores(view, refined)))])
+        """The hypothesis with the best score: much evidence in the photograph, and a low predicted angle."""
+        best = self._on_contour(view, self._best(judge, refined, 1)[0])
         return Estimate(
             T_cam_obj=best.T_cam_obj,
             angle=best.angle,
@@ -223,10 +230,13 @@ class PoseEstimator:
         error = float(np.median(found.scale_px)) if found is not None and len(found.scale_px) else USUAL
         return presence(agreement_of(observed, rendered), error)
 
-    def _scores(self, view: View, refined: Sequence[Refinement]) -> list[float]:
-        poses = [r.T_cam_obj for r in refined]
-        measured = agreements(view, self.model, poses, self.renderer, self.predictor.size)
-        return [score(r.angle, agreement) for r, agreement in zip(refined, measured, strict=True)]
+    def _scores(self, judge: Judge, refined: Sequence[Refinement]) -> list[float]:
+        evidence = judge.scores([r.T_cam_obj for r in refined])
+        return [score(r.angle, each) for r, each in zip(refined, evidence, strict=True)]
+
+    def _judge_of(self, view: View, T_cam_obj: Pose) -> Judge:
+        """Of a known pose's surroundings."""
+        return Judge(view, self._box(view, T_cam_obj), self.model, self.renderer)
 
     def _box(self, view: View, T_cam_obj: Pose) -> Box:
         points = T_cam_obj.apply(self.model.outline)
@@ -234,9 +244,9 @@ class PoseEstimator:
         return view.camera.points_box(points)
 
 
-def score(angle: float, agreement: Agreement) -> float:
-    """Between 0 and 1, of a predicted angle (radians) and the agreement: see docs/decisions/0005."""
-    return float(np.exp(-angle / np.deg2rad(30.0)) * (agreement.silhouette + 0.5 * max(0.0, agreement.colour)) / 1.5)
+def score(angle: float, evidence: float) -> float:
+    """What hypotheses are chosen by, of a predicted angle (radians) and the evidence: docs/decisions/0018."""
+    return evidence - DOUBT * angle
 
 
 def presence(agreement: Agreement, error_px: float) -> float:

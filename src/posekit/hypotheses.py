@@ -8,15 +8,16 @@ are taken out. Nothing in it is learned.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from posekit.camera import Camera
+from posekit.camera import Box, Camera, Zoom
 from posekit.errors import PromptError, WeightsError
+from posekit.evidence import Palette, Picture, Silhouettes, Weights
 from posekit.geometry import (
     Pose,
     cube_views,
@@ -34,11 +35,14 @@ from posekit.object_model import ObjectModel
 from posekit.render import Light, Renderer
 from posekit.results import Detection
 from posekit.view import View
-from posekit.zoom import frontal_camera, frontal_pose, zoom_to_box, zoom_to_pose
+from posekit.zoom import box_window, frontal_camera, frontal_pose, zoom_to_box
 
 Array = NDArray[np.float64]
 FArray = NDArray[np.float32]
 
+TEMPLATE = 64  # side of the box search's templates, pixels
+JUDGED = 96  # side of the window in which poses are judged, pixels
+FINER = 2  # times as fine as it is compared, a crop is kept
 FLAT = 20.0  # a gradient below which brightness says little, in Sobel's units of 8 bits
 
 
@@ -176,6 +180,210 @@ class TemplateSearch:
         return Pose.rotation(crop.R_view_cam.T) @ T_view_ctr @ self.model.T_obj_ctr.inverse()
 
 
+@dataclass(frozen=True)
+class BoxOptions:
+    """views: directions over the sphere. turns: in-plane rotations, a multiple of 4. side: of the compared pictures,
+    pixels; root: square root of the box's area in them. aspect: factor by which a silhouette's aspect may differ from
+    the box's. tried: silhouettes that are moved. apart: least angle between two hypotheses. weights: of the evidence.
+    """
+
+    views: int = 200
+    turns: int = 24
+    side: int = 48
+    root: float = 26.0
+    aspect: float = 1.42
+    tried: int = 64
+    apart: float = float(np.deg2rad(20.0))
+    weights: Weights = Weights()
+
+
+@dataclass(frozen=True)
+class _Move:
+    """Of a silhouette in its picture: pixels to the side, a factor of its size, a turn (radians)."""
+
+    x: float = 0.0
+    y: float = 0.0
+    scale: float = 1.0
+    turn: float = 0.0
+
+    def matrix(self, side: int) -> Array:
+        """(2, 3), of the picture's pixels, about its middle."""
+        c, s = self.scale * np.cos(self.turn), self.scale * np.sin(self.turn)
+        R, middle = np.array([[c, -s], [s, c]]), np.full(2, 0.5 * side - 0.5)
+        return np.column_stack([R, middle + (self.x, self.y) - R @ middle])
+
+
+@dataclass(frozen=True, eq=False)
+class _Placed:
+    """How a template lies in the compared picture. view: its number. turn: in the picture's plane, radians. aspect: its
+    box's width over height. scale: from the template's pixels. offset: (2,), from its box's middle to the object's
+    centre, pixels."""
+
+    view: int
+    turn: float
+    aspect: float
+    scale: float
+    offset: Array
+
+    def turned(self) -> _Placed:
+        """By a quarter turn clockwise."""
+        offset = np.array([-self.offset[1], self.offset[0]])
+        return _Placed(self.view, self.turn + 0.5 * np.pi, 1 / self.aspect, self.scale, offset)
+
+
+MOVES = tuple(
+    _Move(x, y, scale, turn)
+    for x in (-1.5, 0.0, 1.5)
+    for y in (-1.5, 0.0, 1.5)
+    for scale in (0.94, 1.0, 1.06)
+    for turn in (-np.pi / 36, 0.0, np.pi / 36)
+)
+
+
+class BoxSearch:
+    """First poses from a box alone: every template's silhouette, laid into the box, is tried as the object's mask.
+
+    The templates are made once per mesh, all with the same area of their boxes; a photograph is zoomed so that the box
+    has that area. Evidence of colours and edges says which silhouette the picture shows (`posekit.evidence`); the
+    best ones are then moved, scaled and turned a little.
+    """
+
+    def __init__(self, model: ObjectModel, renderer: Renderer, options: BoxOptions = BoxOptions()) -> None:
+        """Raises PromptError where the mesh leaves no silhouette."""
+        self.model, self.options, self.weights = model, options, weights_for(model, options.weights)
+        self.rotations = [view_rotation(d) for d in fibonacci_sphere(options.views)]
+        self.distance = 4.0 * model.diameter
+        focal = 0.9 * TEMPLATE * self.distance / model.diameter
+        self.camera = Camera(focal, focal, 0.5 * TEMPLATE - 0.5, 0.5 * TEMPLATE - 0.5, TEMPLATE, TEMPLATE)
+        poses = [Pose(R, np.array([0, 0, self.distance])) @ model.T_obj_ctr.inverse() for R in self.rotations]
+        views = renderer.render(model, poses, self.camera, light=Light(), coords=False)
+        turns = np.arange(options.turns // 4) * (2 * np.pi / options.turns)
+        found = [self._place(k, view, turn) for k, view in enumerate(views) for turn in turns]
+        usable = [each for each in found if each is not None]
+        if not usable:
+            raise PromptError(f"{model.name} leaves no silhouette from any side: its surface is too thin to search.")
+        self.placed = [placed for placed, _, _ in usable]
+        quarters = [Silhouettes.of([mask for _, mask, _ in usable], [image for _, _, image in usable])]
+        for _ in range(3):
+            quarters.append(quarters[-1].turned())
+            self.placed += [placed.turned() for placed in self.placed[-len(usable) :]]
+        self.silhouettes = Silhouettes.joined(quarters)
+        self.aspects = np.array([placed.aspect for placed in self.placed])
+
+    def search(self, view: View, detection: Detection, count: int) -> list[Hypothesis]:
+        """The best ``count`` first poses for a detection, best first, none nearer to another than ``apart``.
+
+        view: the photograph. detection: its box; where it has a mask, its overlap with the silhouette counts too.
+        """
+        zoom = box_window(view.camera, detection.box, FINER * self.options.side, self.options.root / self.options.side)
+        masked = view.with_mask(detection.mask)
+        crop, shown = masked.zoomed(zoom), shown_in(view, zoom)
+        if not shown.any() or (detection.mask is not None and (crop.mask is None or not crop.mask.any())):
+            return []
+        palette = Palette(crop.image, shown)
+        box = view.camera.box_corner_rays(detection.box) @ zoom.R_view_cam.T
+        size = np.ptp(box[:, :2] / box[:, 2:], axis=0)
+        different = np.abs(np.log(self.aspects * size[1] / size[0]))
+        rows = np.flatnonzero(different < max(np.log(self.options.aspect), different.min() + 1e-6))
+        found = self.silhouettes.chosen(rows)
+        scores = found.scores(self._picture(crop, shown, palette, _Move()), self.weights)
+        best = rows[np.argsort(-scores, kind="stable")[: self.options.tried]]
+        moves, scores = self._moved(crop, shown, palette, best)
+        return self._apart(crop, best, moves, scores, count)
+
+    def _apart(
+        self, crop: View, rows: NDArray[np.intp], moves: Sequence[_Move], scores: FArray, count: int
+    ) -> list[Hypothesis]:
+        found: list[Hypothesis] = []
+        for k in np.argsort(-scores, kind="stable"):
+            pose = self._pose(crop, self.placed[rows[k]], moves[k])
+            if all(rotation_angle(pose.R.T @ h.T_cam_obj.R) > self.options.apart for h in found):
+                found.append(Hypothesis(pose, float(scores[k])))
+            if len(found) == count:
+                break
+        return found
+
+    def _moved(
+        self, crop: View, shown: NDArray[np.bool_], palette: Palette, rows: NDArray[np.intp]
+    ) -> tuple[list[_Move], FArray]:
+        """The best of MOVES for each of some silhouettes, and its score."""
+        some = self.silhouettes.chosen(rows)
+        tried = [some.scores(self._picture(crop, shown, palette, move), self.weights) for move in MOVES]
+        table = np.stack(tried)
+        best = table.argmax(0)
+        return [MOVES[k] for k in best], np.asarray(table.max(0), np.float32)
+
+    def _picture(self, crop: View, shown: NDArray[np.bool_], palette: Palette, move: _Move) -> Picture:
+        """The crop as a silhouette that is moved so sees it. crop: FINER times as fine."""
+        side = self.options.side
+        M = np.zeros((2, 3))
+        there = move.matrix(side)
+        M[:, :2], M[:, 2] = FINER * there[:, :2], FINER * (there[:, 2] + 0.5) - 0.5
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        image = cv2.warpAffine(crop.image, M, (side, side), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        on, mask = (
+            None if each is None else cv2.warpAffine(each.astype(np.float32), M, (side, side), flags=flags) > 0.5
+            for each in (shown, crop.mask)
+        )
+        assert on is not None
+        return Picture.of(image, on, palette, mask)
+
+    def _place(
+        self, number: int, view: View, turn: float
+    ) -> tuple[_Placed, NDArray[np.bool_], NDArray[np.uint8]] | None:
+        """A template turned and scaled to the compared picture: how it lies, its mask (H, W) and RGB (H, W, 3)."""
+        side = self.options.side
+        points = cv2.findNonZero(_u8(view.mask))
+        if points is None:
+            return None
+        c, s = np.cos(turn), np.sin(turn)
+        R = np.array([[c, -s], [s, c]])
+        turned = points.reshape(-1, 2) @ R.T
+        low, high = turned.min(0), turned.max(0)
+        width, height = high - low + 1
+        scale = float(self.options.root / np.sqrt(width * height))
+        M = np.column_stack([scale * R, 0.5 * side - 0.5 - scale * 0.5 * (low + high)])
+        mask = cv2.warpAffine(_u8(view.mask).astype(np.float32), M, (side, side), flags=cv2.INTER_LINEAR) > 0.5
+        if mask.sum() < 8:
+            return None
+        image = cv2.warpAffine(view.image, M, (side, side), flags=cv2.INTER_LINEAR)
+        offset = scale * (R @ (self.camera.cx, self.camera.cy) - 0.5 * (low + high))
+        return _Placed(number, turn, float(width / height), scale, offset), mask, np.asarray(image, np.uint8)
+
+    def _pose(self, crop: View, placed: _Placed, move: _Move) -> Pose:
+        """The template's pose at the place and depth where its silhouette was laid (in the photograph)."""
+        side = self.options.side
+        camera = crop.camera.resized(side, side)
+        M = move.matrix(side)
+        pixel = M[:, :2] @ (placed.offset + (0.5 * side - 0.5)) + M[:, 2]
+        depth = self.distance * camera.fx / (placed.scale * move.scale * self.camera.fx)
+        R = so3_exp([0.0, 0.0, placed.turn + move.turn]) @ self.rotations[placed.view]
+        t = camera.backproject(pixel, depth)
+        T_view_ctr = Pose(rotation_between([0.0, 0.0, 1.0], t) @ R, t)  # along this ray it looks as the template does
+        return Pose.rotation(crop.R_view_cam.T) @ T_view_ctr @ self.model.T_obj_ctr.inverse()
+
+
+class Judge:
+    """Evidence for rendered poses in one window of a photograph, so that poses can be compared with each other."""
+
+    def __init__(self, view: View, box: Box, model: ObjectModel, renderer: Renderer, weights: Weights = Weights()):
+        """view: the photograph; its mask, where there is one, counts too. box: edges, round what the poses show."""
+        self.model, self.renderer, self.weights = model, renderer, weights_for(model, weights)
+        self.zoom = box_window(view.camera, box, JUDGED, BoxOptions.root / BoxOptions.side)
+        crop, shown = view.zoomed(self.zoom), shown_in(view, self.zoom)
+        self.picture = Picture.of(crop.image, shown, Palette(crop.image, shown), crop.mask) if shown.any() else None
+
+    def scores(self, poses: Sequence[Pose]) -> list[float]:
+        """Of each ``T_cam_obj``, as `Silhouettes.scores`; 0 for one that shows nothing in the window."""
+        if self.picture is None or not poses:
+            return [0.0] * len(poses)
+        turned = [Pose.rotation(self.zoom.R_view_cam) @ pose for pose in poses]
+        drawn = self.renderer.render(self.model, turned, self.zoom.camera, coords=False)
+        masks = [np.asarray(each.mask, np.bool_) for each in drawn]
+        scores = Silhouettes.of(masks, [each.image for each in drawn]).scores(self.picture, self.weights)
+        return [float(score) if mask.any() else 0.0 for score, mask in zip(scores, masks, strict=True)]
+
+
 class MVNetSearch:
     """The paper's first pose: MV-Net compares the crop with the six views of a cube's faces (section 3.2).
 
@@ -237,17 +445,6 @@ class Agreement:
     structure: float = 0.0
 
 
-def agreements(
-    view: View, model: ObjectModel, poses: Sequence[Pose], renderer: Renderer, size: tuple[int, int]
-) -> list[Agreement]:
-    """Render each ``T_cam_obj`` in a zoomed view of ``size`` (width, height), and compare."""
-    outline = model.outline - model.center
-    zooms = [zoom_to_pose(view.camera, T @ model.T_obj_ctr, outline, size) for T in poses]
-    turned = [Pose.rotation(zoom.R_view_cam) @ T for zoom, T in zip(zooms, poses, strict=True)]
-    drawn = renderer.render(model, turned, [z.camera for z in zooms], coords=False)
-    return [agreement_of(view.zoomed(zoom), d) for zoom, d in zip(zooms, drawn, strict=True)]
-
-
 def agreement_of(observed: View, rendered: View) -> Agreement:
     """Of a photograph's crop and the object drawn for the same camera."""
     assert rendered.mask is not None
@@ -278,6 +475,18 @@ def _gradients(image: NDArray[np.uint8]) -> FArray:
     """Sobel's, of the slightly blurred brightness, (H, W, 2)."""
     grey = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1.0)
     return np.dstack([cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)])
+
+
+def weights_for(model: ObjectModel, weights: Weights) -> Weights:
+    """Without the colour agreement for a mesh without colours: its shading depends on a light that nobody knows."""
+    plain = model.colors is None and model.texture is None
+    return replace(weights, agreement=0.0) if plain else weights
+
+
+def shown_in(view: View, zoom: Zoom) -> NDArray[np.bool_]:
+    """Where (H, W) a zoomed picture shows the photograph."""
+    ones = np.ones((view.camera.height, view.camera.width), np.uint8)
+    return np.asarray(cv2.warpPerspective(ones, zoom.homography, zoom.camera.size, flags=cv2.INTER_NEAREST) > 0)
 
 
 def box_mask(box: tuple[float, float, float, float], camera: Camera) -> NDArray[np.bool_]:

@@ -46,6 +46,16 @@ def zoom_to_box(camera: Camera, box: Box, size: tuple[int, int], *, enlarge: flo
     return Zoom.look_at(camera, ray, enlarge * _half_width(ray, camera.box_corner_rays(box), size), size)
 
 
+def box_window(camera: Camera, box: Box, side: int, root: float) -> Zoom:
+    """The square window centred on a box (edges) in which the square root of the box's area is ``root`` of the side.
+
+    side: pixels."""
+    ray = camera.box_centre_ray(box)
+    turned = camera.box_corner_rays(box) @ rotation_between(ray, [0.0, 0.0, 1.0]).T
+    width, height = np.ptp(turned[:, :2] / np.maximum(turned[:, 2:], 1e-6), axis=0)
+    return Zoom.look_at(camera, ray, 0.5 * float(np.sqrt(width * height)) / root, (side, side))
+
+
 def frontal_camera(model: ObjectModel, size: tuple[int, int]) -> tuple[Camera, float]:
     """The camera of MV-Net's views and the object's distance: a crop 4:3 round the frontal view's box.
 

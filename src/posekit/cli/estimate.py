@@ -61,7 +61,7 @@ def estimate(
     camera: CameraOption = None,
     box: BoxOption = None,
     mask: MaskOption = None,
-    mask_from: MaskFromOption = "grabcut",
+    mask_from: MaskFromOption = "none",
     detections: DetectionsOption = None,
     detector: DetectorOption = None,
     instances: InstancesOption = 1,

@@ -10,7 +10,7 @@ import typer
 Units = Literal["auto", "mm", "m"]
 Update = Literal["correspondence", "regression"]
 Stop = Literal["angle", "fixed"]
-MaskFrom = Literal["grabcut", "filled"]
+MaskFrom = Literal["none", "grabcut", "filled"]
 
 INPUT, LOOP, OUTPUT = "Input", "Refinement", "Output"
 
@@ -63,7 +63,9 @@ DetectorOption = Annotated[
         rich_help_panel=INPUT,
     ),
 ]
-MaskFromOption = Annotated[MaskFrom, typer.Option(help="How a box becomes a mask.", rich_help_panel=INPUT)]
+MaskFromOption = Annotated[
+    MaskFrom, typer.Option(help="How a box becomes a mask; first poses need none.", rich_help_panel=INPUT)
+]
 
 PresetOption = Annotated[str, typer.Option(help="The networks: lite or paper.", rich_help_panel=LOOP)]
 WeightsOption = Annotated[

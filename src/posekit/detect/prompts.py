@@ -1,4 +1,4 @@
-"""Detections that a person gives: a box, or a mask. From a box the mask comes from GrabCut."""
+"""Detections that a person gives: a box, or a mask. Where a box's mask is asked for, it comes from GrabCut."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from posekit.view import View
 
 Mask = NDArray[np.bool_]
 
-MASK_SOURCES = ("grabcut", "filled")
+MASK_SOURCES = ("none", "grabcut", "filled")
 
 # Chosen on real crops: docs/decisions/0004-mask-from-a-box.md
 _SIDE = 176  # longer side of the picture that GrabCut works on, pixels
@@ -41,12 +41,13 @@ class Detector(Protocol):
 class BoxPrompt:
     """A box round the object, edges (x0, y0, x1, y1) in pixels.
 
-    mask_from: "grabcut" or "filled" (the box itself). Where GrabCut's answer cannot be the object's silhouette, the
-    filled box is taken, and the detection's ``source`` says "box+filled" instead of "box+grabcut".
+    mask_from: "none" (first poses need no mask), "grabcut" or "filled" (the box itself). Where GrabCut's answer cannot
+    be the object's silhouette, the filled box is taken, and the detection's ``source`` says "box+filled" instead of
+    "box+grabcut".
     """
 
     box: Box
-    mask_from: str = "grabcut"
+    mask_from: str = "none"
 
     def __post_init__(self) -> None:
         if self.mask_from not in MASK_SOURCES:
@@ -55,6 +56,8 @@ class BoxPrompt:
     def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
         """One detection for each model. Raises PromptError where the box is inside out or outside the picture."""
         box = clip_box(self.box, view.camera)
+        if self.mask_from == "none":
+            return [Detection(box=box, label=model.name) for model in models]
         mask = grabcut_mask(view.image, box) if self.mask_from == "grabcut" else None
         source = "box+filled" if mask is None else "box+grabcut"
         mask = filled_mask(box, view.camera) if mask is None else mask
