@@ -144,13 +144,17 @@ def _result(
     view: View, results: Sequence[tuple[PoseEstimator, Sequence[Estimate]]], files: Sequence[Mapping[str, Path]]
 ) -> str:
     """The entries of one mesh as they are; of several, ``mesh`` lists them."""
-    camera = view.camera
+    camera, lens = view.camera, view.lens
     about: dict[str, object] = dict(files[0])
+    seen_by: dict[str, object] = {"K": camera.K, "width": camera.width, "height": camera.height}
+    if lens is not None:  # boxes, masks and overlays are of the undistorted picture
+        taken = {"K": lens.camera.K, "width": lens.camera.width, "height": lens.camera.height}
+        seen_by["undistorted_from"] = {**taken, "model": lens.model, "distortion_coefficients": list(lens.coefficients)}
     if len(files) > 1:
         about["mesh"] = [each["mesh"] for each in files]
     return estimates_to_json(
         [estimate for _, estimates in results for estimate in estimates],
         weights_hash=results[0][0].weights_hash,
         versions={name: version(name) for name in ("torch", "numpy", "opencv-python-headless", "moderngl")},
-        about={**about, "camera": {"K": camera.K, "width": camera.width, "height": camera.height}},
+        about={**about, "camera": seen_by},
     )
