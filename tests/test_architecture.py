@@ -14,7 +14,7 @@ SOURCE = Path(__file__).resolve().parent.parent / "src" / "posekit"
 # A room (a module of the top level, or a package) and its layer. Imports go down only.
 # Rooms that are planned stand here too; a room that is built must stand here.
 LAYERS = {
-    0: {"geometry", "camera", "files", "lens", "polygons", "pixels"},
+    0: {"geometry", "camera", "files", "lens", "polygons", "pixels", "mesh_files"},
     1: {"view", "object_model", "results"},
     2: {"load", "calibration", "zoom", "metrics", "pnp", "fusion", "render", "nets", "detect", "draw"},
     3: {"data", "refine", "hypotheses", "figures", "odometry", "video", "contour", "region", "recording"},
@@ -26,7 +26,11 @@ LAYERS = {
 ANYWHERE = {"errors", "_version"}
 # Fusion weighs what PnP alone solves. A camera turns rays; tracking and the search for instances are measured too.
 SIBLINGS = {("camera", "geometry"), ("fusion", "pnp"), ("evaluate", "track"), ("evaluate", "search")}
-SIBLINGS |= {("lens", "camera"), ("load", "calibration")}  # a lens belongs to a camera, a photograph to a calibration
+SIBLINGS |= {
+    ("mesh_files", "polygons"),
+    ("lens", "camera"),
+    ("load", "calibration"),
+}  # a lens belongs to a camera, a photograph to a calibration
 SIBLINGS |= {("odometry", "region")}  # a look keeps its outline
 
 # A foreign library and the rooms whose door it is.

@@ -366,8 +366,8 @@ def _is_fisheye(flat: Mapping[str, Any], distorted: bool) -> bool:
         found |= model in _FISHEYE
         if model not in (*_PINHOLE, *_FISHEYE) and (distorted or name in ("distortionmodel", "cameramodel")):
             raise CameraError(
-                f"its {name} is {flat[name]!r}, which posekit does not have: calibrate with OpenCV's pinhole or fisheye "
-                "model, or undistort the picture yourself and leave the distortion out."
+                f"its {name} is {flat[name]!r}, which posekit does not have: calibrate with OpenCV's pinhole or "
+                "fisheye model, or undistort the picture yourself and leave the distortion out."
             )
     return found
 

@@ -36,9 +36,9 @@ class Lens:
         counts = COUNTS[self.model]
         if len(self.coefficients) not in counts or not np.isfinite(self.coefficients).all():
             raise CameraError(
-                f"{len(self.coefficients)} distortion coefficients {list(self.coefficients)} for a {self.model} camera: "
-                f"OpenCV has {', '.join(map(str, counts))} finite numbers. Calibrate with OpenCV's models, or undistort "
-                "the picture yourself and leave them out."
+                f"{len(self.coefficients)} distortion coefficients {list(self.coefficients)} for a {self.model} "
+                f"camera: OpenCV has {', '.join(map(str, counts))} finite numbers. Calibrate with OpenCV's models, or "
+                "undistort the picture yourself and leave them out."
             )
         _ = self.ideal  # refused here, not at the first picture
 

@@ -262,8 +262,8 @@ def load_camera(source: str | Path, size: Size, image: str | Path | None = None)
     found = load_calibration(source, size, image)
     if found.lens is not None:
         raise CameraError(
-            f"{source} has lens distortion ({', '.join(f'{v:g}' for v in found.lens.coefficients)}), which a Camera has "
-            "not: load the photograph with posekit.load.load_view, or take the camera and the lens from "
+            f"{source} has lens distortion ({', '.join(f'{v:g}' for v in found.lens.coefficients)}), which a Camera "
+            "has not: load the photograph with posekit.load.load_view, or take the camera and the lens from "
             "posekit.calibration.load_calibration."
         )
     return found.camera
