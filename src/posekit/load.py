@@ -284,7 +284,7 @@ def load_pose(path: str | Path) -> Pose:
         '"cam_t_m2c": 3 numbers in mm}.'
     )
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(path.read_text(encoding="utf-8-sig"))
         if isinstance(data, dict) and "estimates" in data:
             if not data["estimates"]:
                 raise PromptError(f"the result {path} has no estimates, so there is no pose to start from: {needed}")

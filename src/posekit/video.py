@@ -158,9 +158,9 @@ class SceneFrames:
 
     def __init__(self, folder: Path) -> None:
         try:
-            cameras = json.loads((folder / "scene_camera.json").read_text(encoding="utf-8"))
+            cameras = json.loads((folder / "scene_camera.json").read_text(encoding="utf-8-sig"))
             self.cameras: Mapping[int, Any] = {int(k): v for k, v in sorted(cameras.items(), key=lambda kv: int(kv[0]))}
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, AttributeError) as error:
             raise InputError(f"{folder / 'scene_camera.json'} cannot be read: {error}.") from error
         self.folder, self.count = folder, len(self.cameras)
         self.scene = int(folder.name) if folder.name.isdigit() else 0
@@ -178,11 +178,10 @@ class SceneFrames:
                 yield Frame(number, None, problem=str(error), scene=self.scene)
 
     def _path(self, number: int) -> Path:
-        for kind in ("rgb", "gray"):
-            for suffix in PICTURES:
-                path = self.folder / kind / f"{number:06d}{suffix}"
-                if path.is_file():
-                    return path
+        names = dict.fromkeys((f"{number:06d}", str(number)))
+        for path in (self.folder / k / (n + s) for n in names for k in ("rgb", "gray") for s in PICTURES):
+            if path.is_file():
+                return path
         raise ImageError(f"the scene {self.folder} has no picture {number:06d} in rgb.")
 
 
