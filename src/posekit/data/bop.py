@@ -346,15 +346,19 @@ def _mesh(path: Path) -> ObjectModel:
     try:
         return ObjectModel.load(path, units="mm")
     except MeshError:
-        try:
-            model = ObjectModel.load(path, units="m")
-        except MeshError:
-            model = None
+        model = _in_metres(path)
         if model is None:
             raise
     log.warning("%s: BOP's meshes are in mm, which would make it %.3g mm long; it is taken for metres.", path.name,
                 model.diameter)  # fmt: skip
     return model
+
+
+def _in_metres(path: Path) -> ObjectModel | None:
+    try:
+        return ObjectModel.load(path, units="m")
+    except MeshError:
+        return None
 
 
 def _json(path: Path) -> Any:
