@@ -18,11 +18,14 @@ import cv2
 import numpy as np
 import pytest
 
+from objects import bracket
 from posekit.calibration import load_calibration
 from posekit.camera import Camera
+from posekit.cli.prompts import prompt_for
 from posekit.errors import CameraError
 from posekit.lens import Lens
 from posekit.load import load_camera, load_view
+from posekit.view import View
 
 FX, FY, CX, CY = 572.4, 573.5, 325.2, 242.0
 ROWS = [[FX, 0.0, CX], [0.0, FY, CY], [0.0, 0.0, 1.0]]
@@ -232,3 +235,27 @@ def test_a_view_is_undistorted_and_says_so(tmp_path: Path, caplog: pytest.LogCap
     rows, columns = np.nonzero(view.image[..., 0] > 127)
     np.testing.assert_allclose((columns.mean(), rows.mean()), view.camera.project(point)[0], atol=0.8)
     assert "the picture is undistorted (pinhole, -0.3, 0.1" in caplog.text
+
+
+def test_boxes_and_masks_of_the_photograph_are_moved(tmp_path: Path) -> None:
+    """What a person gives is of the photograph as it was taken."""
+    lens = LENSES[0]
+    [[u, v]] = lens.project([[0.4, 0.3, 1.0]])
+    [[x, y]] = lens.ideal.project([[0.4, 0.3, 1.0]])
+    view = View(np.zeros((lens.ideal.height, lens.ideal.width, 3), np.uint8), lens.ideal, lens=lens)
+    box = f"{u - 19.5},{v - 19.5},{u + 20.5},{v + 20.5}"
+    mask = np.zeros((480, 640), np.uint8)
+    mask[round(v) - 20 : round(v) + 21, round(u) - 20 : round(u) + 21] = 255
+    cv2.imwrite(str(tmp_path / "m.png"), mask)
+    entry = {"image_id": 1, "category_id": 1, "bbox": [u - 19.5, v - 19.5, 40, 40]}
+    (tmp_path / "d.json").write_text(json.dumps([entry]))
+    for prompt in (
+        prompt_for(box, None, "filled", lens=lens),
+        prompt_for(None, tmp_path / "m.png", "filled", lens=lens),
+        prompt_for(None, None, "filled", tmp_path / "d.json", tmp_path / "1.png", lens),
+    ):
+        assert prompt is not None
+        [found] = prompt.detect(view, [bracket()])
+        middle = 0.5 * (found.box[0] + found.box[2]) - 0.5, 0.5 * (found.box[1] + found.box[3]) - 0.5
+        np.testing.assert_allclose(middle, (x, y), atol=2)
+        assert found.mask is None or found.mask.shape == view.image.shape[:2]

@@ -6,7 +6,7 @@ import json
 import logging
 import re
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -193,7 +193,7 @@ def ply_faces(
     return np.concatenate(faces), np.concatenate(sources)
 
 
-def _polygons(data: Any) -> Sequence[Any] | None:
+def _polygons(data: Any) -> Any:
     names = ("vertex_index", "vertex_indices")
     if isinstance(data, Mapping):
         return next((data[name] for name in names if name in data), None)

@@ -345,10 +345,11 @@ def _mesh(path: Path) -> ObjectModel:
     """A mesh in BOP's millimetres; in metres where it could not be an object otherwise, which is told."""
     try:
         return ObjectModel.load(path, units="mm")
-    except MeshError:
+    except MeshError as error:
         model = _in_metres(path)
         if model is None:
-            raise
+            reason = str(error).partition("; posekit works")[0]
+            raise MeshError(f"{reason}. The meshes of a data set in BOP layout are in mm: scale it.") from error
     log.warning("%s: BOP's meshes are in mm, which would make it %.3g mm long; it is taken for metres.", path.name,
                 model.diameter)  # fmt: skip
     return model
