@@ -14,9 +14,9 @@ SOURCE = Path(__file__).resolve().parent.parent / "src" / "posekit"
 # A room (a module of the top level, or a package) and its layer. Imports go down only.
 # Rooms that are planned stand here too; a room that is built must stand here.
 LAYERS = {
-    0: {"geometry", "camera", "files"},
+    0: {"geometry", "camera", "files", "lens", "polygons", "pixels", "mesh_files"},
     1: {"view", "object_model", "results"},
-    2: {"load", "zoom", "metrics", "pnp", "fusion", "render", "nets", "detect", "draw", "evidence"},
+    2: {"load", "calibration", "zoom", "metrics", "pnp", "fusion", "render", "nets", "detect", "draw", "evidence"},
     3: {
         "data",
         "refine",
@@ -38,6 +38,11 @@ LAYERS = {
 ANYWHERE = {"errors", "_version"}
 # Fusion weighs what PnP alone solves. A camera turns rays; tracking and the search for instances are measured too.
 SIBLINGS = {("camera", "geometry"), ("fusion", "pnp"), ("evaluate", "track"), ("evaluate", "search")}
+SIBLINGS |= {
+    ("mesh_files", "polygons"),
+    ("lens", "camera"),
+    ("load", "calibration"),
+}  # a lens belongs to a camera, a photograph to a calibration
 SIBLINGS |= {("odometry", "region")}  # a look keeps its outline
 # MV-Net is trained and used with the same views; its search is one of several that give first poses.
 SIBLINGS |= {("data", "view_bank"), ("mvnet_search", "view_bank"), ("mvnet_search", "hypotheses")}
@@ -47,6 +52,8 @@ DOORS = {
     "moderngl": {"render"},
     "glcontext": {"render"},
     "trimesh": {"object_model"},
+    "mapbox_earcut": {"polygons"},
+    "yaml": {"calibration"},
     "torchvision": {"detect", "train"},
     "lightning_fabric": {"train"},
     "typer": {"cli"},

@@ -183,3 +183,48 @@ def test_a_damaged_photograph(root: Path) -> None:
     (root / "test" / "000002" / "rgb" / "000003.png").write_bytes(b"\x89PNG")
     with pytest.raises(ImageError):
         BopDataset(root).view(2, 3)
+
+
+# --- sets as people make them ---
+
+
+@pytest.mark.parametrize("kind", ["rgb", "gray"])
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"])
+def test_pictures_of_every_suffix(kind: str, suffix: str, root: Path) -> None:
+    folder = root / "test" / "000002"
+    (folder / "rgb" / "000003.png").unlink()
+    (folder / kind).mkdir(exist_ok=True)
+    Image.new("L", (64, 48), 90).save(folder / kind / f"000003{suffix}")
+    assert BopDataset(root).view(2, 3).image[0, 0].tolist() == pytest.approx([90] * 3, abs=2)
+
+
+def test_folders_pictures_and_meshes_without_zeros(root: Path) -> None:
+    (root / "test" / "000002").rename(root / "test" / "2")
+    (root / "test" / "2" / "rgb" / "000003.png").rename(root / "test" / "2" / "rgb" / "3.png")
+    trimesh.load(root / "models" / "obj_000009.ply").export(root / "models" / "obj_9.obj")
+    (root / "models" / "obj_000009.ply").unlink()
+    data = BopDataset(root)
+    assert data.scenes() == [2, 40] and data.view(2, 3).camera.fx == 503
+    np.testing.assert_allclose(data.model(9).extents, [0.109, 0.06, 0.04], atol=1e-6)
+
+
+def test_a_byte_order_mark(root: Path) -> None:
+    for path in root.rglob("*.json"):
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    data = BopDataset(root)
+    assert len(data.instances(2, 3)) == 3 and len(data.model(9).symmetries.discrete) == 1
+
+
+def test_models_in_metres_are_told(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    trimesh.creation.box((0.1, 0.06, 0.04)).export(root / "models" / "obj_000005.ply")
+    np.testing.assert_allclose(BopDataset(root).model(5).extents, [0.1, 0.06, 0.04], atol=1e-6)
+    assert "obj_000005.ply: BOP's meshes are in mm" in caplog.text and "taken for metres" in caplog.text
+
+
+def test_targets_of_pictures_alone_ask_for_all_that_is_in_them(root: Path) -> None:
+    """As BOP'24 has them."""
+    put(root / "test_targets_bop24.json", [{"scene_id": 2, "im_id": 3}])
+    data = BopDataset(root)
+    assert data.images() == [(2, 3)]
+    assert [(t.obj_id, t.count) for t in data.targets or ()] == [(5, 2), (9, 1)]
+    assert len(data.instances(2, 3)) == 3

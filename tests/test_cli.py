@@ -386,7 +386,32 @@ def test_an_unwritable_folder(invoke: Invoke, tmp_path: Path) -> None:
     (tmp_path / "closed").mkdir(mode=0o500)
     result = invoke("estimate", out="closed/out")
     assert result.exit_code == 1
-    assert "error: the folder closed/out cannot be made" in result.stderr
+    assert "error: the output folder closed/out cannot be written" in result.stderr
+
+
+@pytest.mark.skipif(hasattr(os, "geteuid") and os.geteuid() == 0, reason="root may write everywhere")
+@pytest.mark.parametrize("option", ["out", "json"])
+def test_the_output_is_checked_before_anything_is_read(option: str, invoke: Invoke, tmp_path: Path) -> None:
+    (tmp_path / "closed").mkdir(mode=0o500)
+    result = invoke("estimate", "nowhere.png", **{option: "closed/new"})
+    assert_fails(result, "cannot be written", "Permission denied")
+
+
+def test_an_output_folder_below_a_file(invoke: Invoke, tmp_path: Path) -> None:
+    (tmp_path / "taken").touch()
+    assert_fails(invoke("estimate", "nowhere.png", out="taken/out"), "cannot be written", "taken is a file")
+    assert not list(tmp_path.glob("taken/*"))
+
+
+@pytest.mark.parametrize(
+    "error", [ZeroDivisionError("division by zero"), MemoryError(), KeyError("a"), OSError(5, "x")]
+)
+def test_what_nobody_foresaw_has_one_exit(error: Exception, invoke: Invoke, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr("posekit.load.load_image", fail)
+    assert_fails(invoke("estimate"), "something unexpected", type(error).__name__, "please report it", "--debug")
 
 
 def test_errors_are_printed_as_they_are(invoke: Invoke) -> None:

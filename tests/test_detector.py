@@ -297,6 +297,72 @@ def test_detections_files_that_are_something_else(tmp_path: Path) -> None:
     assert categories_of(["cup", "can"]) == {"cup": 1, "can": 2}
 
 
+ENTRY = {"image_id": 1, "category_id": 6, "score": 0.5, "bbox": [1, 2, 10, 20]}
+
+
+def found_in(folder: Path, data: object, image: str = "000001.png", name: str = "obj_000006") -> list[Detection]:
+    (folder / "d.json").write_text(json.dumps(data))
+    view = View(np.zeros((60, 80, 3), np.uint8), Camera.from_fov(1.0, 80, 60))
+    six = ObjectModel.from_arrays(bracket().vertices, bracket().faces, name=name)
+    return DetectionsFile.read(folder / "d.json", folder / image).detect(view, [six])
+
+
+@pytest.mark.parametrize(
+    ("extra", "why"),
+    [
+        ({"bbox": [5, 5, 0, 9]}, "inside out"),
+        ({"bbox": [500, 5, 9, 9]}, "lies outside the picture"),
+        ({"bbox": [-5, 5, 4.5, 9]}, "lies outside the picture"),
+        ({"score": float("nan")}, "without a finite score"),
+        ({"bbox": None}, "neither box nor mask"),
+        ({"bbox": [1, 2]}, "no detection"),
+        ({"segmentation": [[3, 3]]}, "at least three points"),
+        ({"segmentation": [[]]}, "at least three points"),
+        ({"segmentation": [[1, 2, 3, 4, 5]]}, "at least three points"),
+        ({"segmentation": {"size": [9, 9], "counts": [81]}}, "a mask is 9x9, its picture 80x60"),
+        ({"segmentation": {"size": [60, 80], "counts": [-4, 9]}}, "entry 2"),
+        ({"segmentation": {"size": [60, 80], "counts": "ä"}}, "neither COCO's run lengths nor polygons"),
+        ({"category_id": "six"}, "entry 2 is skipped"),
+        ({"image_id": None}, "entry 2 is skipped"),
+    ],
+    ids=str,
+)
+def test_a_bad_entry_is_skipped_and_told(
+    extra: dict[str, object], why: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    found = found_in(tmp_path, [ENTRY, ENTRY | extra, ENTRY | {"score": 0.4}])
+    assert [d.score for d in found] == [0.5, 0.4]
+    assert "d.json: entry 2" in caplog.text and why in caplog.text
+    with pytest.raises(PromptError, match=r"d.json.*none"):
+        found_in(tmp_path, [ENTRY | extra])
+
+
+def test_numbers_may_be_text_and_names_have_any_capitals(tmp_path: Path) -> None:
+    text = [ENTRY | {"image_id": "000001", "category_id": "6"}, ENTRY | {"image_id": "2", "category_id": "6"}]
+    assert len(found_in(tmp_path, text)) == 1
+    assert len(found_in(tmp_path, {"1": [ENTRY], "2": [ENTRY | {"image_id": 2}, ENTRY | {"image_id": 2}]})) == 1
+    coco = {"images": [{"id": 77, "file_name": "rgb/000001.png"}], "categories": [{"id": 1, "name": "Cup"},
+            {"id": 2, "name": "can"}], "annotations": [ENTRY | {"image_id": 77, "category_id": 1},
+            ENTRY | {"image_id": 77, "category_id": 2}]}  # fmt: skip
+    assert len(found_in(tmp_path, coco, name="cup")) == 1
+
+
+def test_what_a_file_has_instead_is_said(tmp_path: Path) -> None:
+    with pytest.raises(PromptError, match=r"nothing for 000009.png \(image 9\); it is about the images 1, 2"):
+        found_in(tmp_path, [ENTRY, ENTRY | {"image_id": 2}], "000009.png")
+    with pytest.raises(PromptError, match=r"nothing for obj_000006 in this picture, only for the categories 5, 9"):
+        found_in(tmp_path, [ENTRY | {"category_id": 5}, ENTRY | {"category_id": 9}])
+    assert found_in(tmp_path, []) == []
+
+
+def test_scenes_are_respected(tmp_path: Path) -> None:
+    scenes = [ENTRY | {"scene_id": 1, "score": 0.9}, ENTRY | {"scene_id": "2"}]
+    (tmp_path / "000002" / "rgb").mkdir(parents=True)
+    assert [d.score for d in found_in(tmp_path, scenes, "000002/rgb/000001.png")] == [0.5]
+    with pytest.raises(PromptError, match=r"about the scenes 1, 2, and the picture lies in no folder"):
+        found_in(tmp_path, scenes)
+
+
 # --- novel objects ------------------------------------------------------------------------------------------------
 
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import logging
+import struct
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -388,10 +390,10 @@ def test_auto_decides_by_the_diameter_and_says_so(
     [
         (7.0, "auto", "could be metres or millimetres: pass --units m or --units mm"),
         (102.0, "m", r"duck.ply has a diameter of 102 m; posekit works in metres: pass --units mm"),
-        (0.5, "mm", r"has a diameter of 0.5 mm; posekit works in metres: pass --units m\."),
+        (0.5, "mm", r"has a diameter of 0.5 mm; posekit works in metres: pass --units m or --units cm"),
         (50_000.0, "auto", "from 1 mm to 10 m: scale the mesh"),
         (0.0004, "auto", "from 1 mm to 10 m: scale the mesh"),
-        (1.0, "inch", "units are auto, mm or m, not 'inch'"),
+        (1.0, "inch", "units are auto, mm, cm, m, in, not 'inch'"),
     ],
 )
 def test_implausible_sizes_are_refused(tmp_path: Path, given: float, units: str, text: str) -> None:
@@ -551,9 +553,6 @@ def test_faces_that_name_no_vertex(tmp_path: Path) -> None:
     (tmp_path / "box.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 2 9\n")
     with pytest.raises(MeshError, match=r"box.obj cannot be read as OBJ.*Export it again"):
         ObjectModel.load(tmp_path / "box.obj")
-    (tmp_path / "relative.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\n")
-    with pytest.raises(MeshError, match="negative face indices"):
-        ObjectModel.load(tmp_path / "relative.obj")
 
 
 def test_missing_and_damaged_textures(tmp_path: Path) -> None:
@@ -577,3 +576,197 @@ def test_arrays_that_do_not_fit() -> None:
         ObjectModel.from_arrays(CORNERS[:, :2], FACES)
     with pytest.raises(MeshError, match=r"colors must be finite numbers in 8 rows"):
         ObjectModel.from_arrays(CORNERS, FACES, colors=COLOURS[:5])
+
+
+# --- meshes as other programs write them ---
+# Read: polygons of any number of corners, concave ones too; colours as fractions, 0 to 255 or 16 bits, of vertices or
+# faces, also named diffuse_red; negative indices; names with %20, other capitals or another machine's folders; binary
+# STL with a wrong count. Refused: polygons that cross themselves, geometry compressed with Draco or meshopt, files
+# outside the mesh's folder. Warned of: colours that are not understood, a count that is wrong.
+
+ELL = [(100, 10), (10, 10), (10, 80), (0, 80), (0, 0), (100, 0)]
+YOU = [(0, 0), (60, 0), (60, 60), (45, 60), (45, 15), (15, 15), (15, 60), (0, 60)]
+ARROW = [(0, 0), (50, 20), (100, 0), (50, 80)]
+
+
+def plate(outline: list[tuple[int, int]], turns: int) -> tuple[np.ndarray, list[list[int]]]:
+    """A plate of an outline, 12 thick: vertices, and polygons whose first corner is any of the outline's."""
+    n = len(outline)
+    vertices = np.array([(x, y, z) for z in (0, 12) for x, y in outline], float)
+    top = [n + (k + turns) % n for k in range(n)]
+    sides = [[k, (k + 1) % n, n + (k + 1) % n, n + k] for k in range(n)]
+    return vertices, [top, [k - n for k in top[::-1]], *sides]
+
+
+def areas_and_volume(model: ObjectModel) -> tuple[float, float]:
+    corners = model.vertices.astype(float)[model.faces] * 1000
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return 0.5 * np.linalg.norm(cross, axis=1).sum(), np.einsum("fi,fi->", corners[:, 0], cross) / 6
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply"])
+@pytest.mark.parametrize("outline", [ELL, YOU, ARROW], ids=["L", "U", "arrow"])
+def test_concave_polygons_keep_their_shape(suffix: str, outline: list[tuple[int, int]], tmp_path: Path) -> None:
+    x, y = np.array(outline, float).T
+    area = 0.5 * abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1)))
+    rim = np.hypot(np.roll(x, -1) - x, np.roll(y, -1) - y).sum()
+    for turns in range(len(outline)):
+        vertices, polygons = plate(outline, turns)
+        path = tmp_path / f"plate.{suffix}"
+        if suffix == "ply":
+            write_ply(path, vertices, polygons)
+        else:
+            path.write_text("".join(f"v {a} {b} {c}\n" for a, b, c in vertices)
+                            + "".join("f " + " ".join(str(k + 1) for k in p) + "\n" for p in polygons))  # fmt: skip
+        surface, volume = areas_and_volume(ObjectModel.load(path, units="mm"))
+        assert surface == pytest.approx(2 * area + 12 * rim, rel=1e-4)
+        assert abs(volume) == pytest.approx(12 * area, rel=1e-4)
+
+
+def test_a_polygon_that_crosses_itself_is_refused(tmp_path: Path) -> None:
+    star = [(np.cos(2.4 * np.pi * k / 3 * 2 / 2), np.sin(2.4 * np.pi * k / 3 * 2 / 2), 0.0) for k in range(5)]
+    path = tmp_path / "star.obj"
+    path.write_text("".join(f"v {a} {b} {c}\n" for a, b, c in star) + "f 1 2 3 4 5\nf 5 4 3 2 1\n")
+    with pytest.raises(
+        MeshError, match=r"star.obj has a polygon of 5 corners that crosses itself.*triangulate the mesh"
+    ):
+        ObjectModel.load(path)
+
+
+def test_negative_indices_and_continued_lines(tmp_path: Path) -> None:
+    vertices, polygons = plate(ELL, 0)
+    path = tmp_path / "plate.obj"
+    text = "".join(f"v {a} {b} {c}\n" for a, b, c in vertices)
+    path.write_text(text + "".join("f " + " \\\n".join(str(k - 12) for k in p) + "\n" for p in polygons))
+    assert abs(areas_and_volume(ObjectModel.load(path, units="mm"))[1]) == pytest.approx(12 * 1700, rel=1e-4)
+
+
+def coloured_ply(path: Path, kind: str, scale: float, names: tuple[str, ...] = ("red", "green", "blue")) -> Path:
+    head = "ply\nformat ascii 1.0\nelement vertex 8\nproperty float x\nproperty float y\nproperty float z\n"
+    head += "".join(f"property {kind} {name}\n" for name in names)
+    head += "element face 12\nproperty list uchar int vertex_indices\nend_header\n"
+    number = "{:.6f}" if kind in ("float", "double") else "{:.0f}"
+    rows = [" ".join([*map(str, v), *(number.format(float(x) * scale) for x in c)])
+            for v, c in zip(CORNERS, COLOURS, strict=True)]  # fmt: skip
+    path.write_text(head + "\n".join(rows) + "\n" + "".join("3 {} {} {}\n".format(*f) for f in FACES))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("kind", "scale"),
+    [("uchar", 1), ("float", 1 / 255), ("double", 1 / 255), ("float", 1), ("double", 1), ("int", 1), ("ushort", 1),
+     ("ushort", 257), ("int", 257), ("uint", 257)],
+)  # fmt: skip
+@pytest.mark.parametrize("names", [("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"),
+                                   ("r", "g", "b")])  # fmt: skip
+def test_colours_of_every_kind(kind: str, scale: float, names: tuple[str, ...], tmp_path: Path) -> None:
+    model = ObjectModel.load(coloured_ply(tmp_path / "c.ply", kind, scale, names))
+    assert model.colors is not None
+    assert {tuple(c) for c in model.colors.tolist()} == {tuple(c) for c in COLOURS.tolist()}
+
+
+def test_colours_that_are_not_understood_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    assert ObjectModel.load(coloured_ply(tmp_path / "a.ply", "float", -1)).colors is None
+    assert "a.ply: its colours are from -230 to 0, which is not understood" in caplog.text
+    assert (
+        ObjectModel.load(coloured_ply(tmp_path / "b.ply", "uchar", 1, ("my_red", "my_green", "my_blue"))).colors is None
+    )
+    assert "b.ply: its colours (my_red, my_green, my_blue) are not understood" in caplog.text
+
+
+@pytest.mark.parametrize("scale", [1, 255])
+def test_obj_colours(scale: int, tmp_path: Path) -> None:
+    rows = [(*v, *(c / 255 * scale)) for v, c in zip(CORNERS, COLOURS, strict=True)]
+    text = "".join("v {} {} {} {:.5f} {:.5f} {:.5f}\n".format(*row) for row in rows)
+    (tmp_path / "c.obj").write_text(text + "".join("f {} {} {}\n".format(*(f + 1)) for f in FACES))
+    model = ObjectModel.load(tmp_path / "c.obj")
+    assert model.colors is not None
+    assert {tuple(c) for c in model.colors.tolist()} == {tuple(c) for c in COLOURS.tolist()}
+
+
+def test_polygons_with_a_colour_of_their_own(tmp_path: Path) -> None:
+    vertices, polygons = plate(ELL, 2)
+    head = "ply\nformat ascii 1.0\nelement vertex 12\nproperty float x\nproperty float y\nproperty float z\n"
+    head += "element face 8\n"
+    head += "property list uchar int vertex_indices\n" + "".join(
+        f"property uchar {c}\n" for c in ("red", "green", "blue")
+    )
+    rows = [" ".join(map(str, v)) for v in vertices]
+    rows += [" ".join(map(str, [len(p), *p, 20 * k, 7, 9])) for k, p in enumerate(polygons)]
+    (tmp_path / "p.ply").write_text(head + "end_header\n" + "\n".join(rows) + "\n")
+    model = ObjectModel.load(tmp_path / "p.ply", units="mm")
+    assert model.colors is not None and abs(areas_and_volume(model)[1]) == pytest.approx(12 * 1700, rel=1e-4)
+    top = model.colors[model.vertices[:, 2] > 0.011]
+    assert (0, 7, 9) in {tuple(c) for c in top.tolist()}
+
+
+@pytest.mark.parametrize("name", ["C:\\Users\\x\\Desktop\\skin.png", "/home/x/skin.png", "SKIN.PNG", "my%20skin.png",
+                                  "..\\tex\\skin.png", "./skin.png", "-bm 1.0 .\\skin.png"])  # fmt: skip
+def test_textures_are_found_beside_the_mesh(name: str, tmp_path: Path) -> None:
+    pixels = picture(tmp_path / ("my skin.png" if "%20" in name else "skin.png"))
+    model = ObjectModel.load(write_obj(tmp_path / "m.obj", name))
+    assert model.texture is not None
+    np.testing.assert_array_equal(model.texture, pixels)
+
+
+def test_nothing_outside_the_meshs_folder_is_read(tmp_path: Path) -> None:
+    picture(tmp_path / "secret.png")
+    (tmp_path / "inside").mkdir()
+    for name in ("../secret.png", str(tmp_path / "secret.png"), "..\\secret.png", "%2e%2e/secret.png"):
+        with pytest.raises(MeshError, match=r"which is not there: put it at .*inside.secret.png"):
+            ObjectModel.load(write_obj(tmp_path / "inside" / "m.obj", name))
+    (tmp_path / "inside" / "link.png").symlink_to(tmp_path / "secret.png")
+    with pytest.raises(MeshError, match="which is not there"):
+        ObjectModel.load(write_obj(tmp_path / "inside" / "m.obj", "link.png"))
+
+
+@pytest.mark.parametrize("bits", [12, 16])
+def test_deep_textures(bits: int, tmp_path: Path) -> None:
+    ramp = np.tile(np.linspace(0, (1 << bits) - 1, 32).astype(np.uint16), (16, 1))
+    cv2.imwrite(str(tmp_path / "skin.png"), np.dstack([ramp, ramp // 2, ramp // 4]))
+    model = ObjectModel.load(write_obj(tmp_path / "m.obj"))
+    assert model.texture is not None and model.texture[0, -1].tolist() == [64, 127, 255]
+    cv2.imwrite(str(tmp_path / "skin.png"), ramp)
+    model = ObjectModel.load(write_obj(tmp_path / "m.obj"))
+    assert model.texture is not None and abs(int(model.texture[0, 16, 0]) - 131) < 2
+
+
+def binary_stl(path: Path, told: int, tail: bytes = b"") -> Path:
+    body = b"".join(struct.pack("<12fH", 0, 0, 0, *CORNERS[f].ravel(), 0) for f in FACES)
+    path.write_bytes(b"solid or not".ljust(80) + struct.pack("<I", told) + body + tail)
+    return path
+
+
+@pytest.mark.parametrize("told", [0, 5, 19, 2**32 - 1])
+def test_stl_is_read_by_its_size(told: int, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    assert len(ObjectModel.load(binary_stl(tmp_path / "a.stl", told)).faces) == 12
+    assert f"a.stl: it says that it has {told} triangles, its size that it has 12" in caplog.text
+
+
+def test_stl_that_is_cut_off(tmp_path: Path) -> None:
+    with pytest.raises(MeshError, match=r"says that it has 20 triangles, and ends within number 13: it is cut off"):
+        ObjectModel.load(binary_stl(tmp_path / "a.stl", 20, bytes(20)))
+
+
+@pytest.mark.parametrize(("extension", "name"), [("KHR_draco_mesh_compression", "Draco"),
+                                                 ("EXT_meshopt_compression", "meshopt")])  # fmt: skip
+def test_compressed_geometry_is_named(extension: str, name: str, tmp_path: Path) -> None:
+    document = json.dumps({"asset": {"version": "2.0"}, "extensionsRequired": [extension]}).encode()
+    document += b" " * (-len(document) % 4)
+    data = struct.pack("<III", 0x46546C67, 2, 20 + len(document)) + struct.pack("<II", len(document), 0x4E4F534A)
+    (tmp_path / "a.glb").write_bytes(data + document)
+    with pytest.raises(MeshError, match=rf"a.glb is compressed with {name}, .*export it without compression"):
+        ObjectModel.load(tmp_path / "a.glb")
+
+
+@pytest.mark.parametrize(("units", "metres"), [("mm", 0.001), ("cm", 0.01), ("m", 1.0), ("in", 0.0254)])
+def test_units_by_hand(units: str, metres: float, tmp_path: Path) -> None:
+    size = np.asarray(BOX.vertices) * (0.1 / metres) / np.linalg.norm((0.10, 0.06, 0.04))
+    assert ObjectModel.load(write_ply(tmp_path / "b.ply", size, FACES), units=units).diameter == pytest.approx(0.1)
+
+
+def test_the_note_on_units_says_the_size(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, logger="posekit")
+    size = np.asarray(BOX.vertices) * 27 / np.linalg.norm((0.10, 0.06, 0.04))
+    ObjectModel.load(write_ply(tmp_path / "b.ply", size, FACES))
+    assert "the object is 27 mm long" in caplog.text and "--units cm makes it 27 cm" in caplog.text

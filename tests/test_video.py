@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 import threading
 import time
 from fractions import Fraction
@@ -11,6 +12,7 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
+import PIL.Image
 import pytest
 
 from posekit.errors import ImageError, InputError
@@ -128,6 +130,61 @@ def test_folders_and_globs_in_the_order_of_names(tmp_path: Path) -> None:
         read = list(open_frames(source))
         assert [None if f.image is None else int(f.image[0, 0, 0]) for f in read] == [20, 30, None, 40]
         assert "1b.png" in read[2].problem
+
+
+def matrix_written(path: Path, degrees: int) -> Path:
+    """The video's display matrix set to a turn clockwise, as phones write it."""
+    a, b, c, d = {0: (1, 0, 0, 1), 90: (0, 1, -1, 0), 180: (-1, 0, 0, -1), 270: (0, -1, 1, 0)}[degrees]
+    data = bytearray(path.read_bytes())
+    start = data.find(b"tkhd") + 4 + 4 + 4 * 5 + 8 + 8
+    values = [a << 16, b << 16, 0, c << 16, d << 16, 0, 0, 0, 0x40000000]
+    data[start : start + 36] = struct.pack(">9i", *values)
+    path.write_bytes(data)
+    return path
+
+
+@pytest.mark.parametrize("degrees", [0, 90, 180, 270])
+def test_frames_are_turned_as_players_do(degrees: int, tmp_path: Path) -> None:
+    upright = picture(3)
+    upright[:20, :20] = 0
+    with VideoWriter(tmp_path / "a.mp4", 30.0) as writer:
+        for _ in range(4):
+            writer.write(np.ascontiguousarray(np.rot90(upright, degrees // 90)))  # turned back clockwise
+    frames = list(open_frames(str(matrix_written(tmp_path / "a.mp4", degrees)), "100,100,48,32"))
+    assert len(frames) == 4
+    for frame in frames:
+        assert frame.image is not None, frame.problem
+        assert np.abs(frame.image.astype(int) - upright).mean() < 4
+
+
+def test_numbers_in_names_count_as_numbers(tmp_path: Path) -> None:
+    names = ["frame_1.png", "frame_2.png", "frame_10.png", "frame_100.png", "take 2_3.png", "take 10_1.png"]
+    for k, name in enumerate(sorted(names)):
+        cv2.imwrite(str(tmp_path / name), picture(k))
+    for source in (str(tmp_path), str(tmp_path / "*.png")):
+        assert [frame.file for frame in open_frames(source, "100,100,48,32")] == names
+
+
+def test_pictures_of_a_folder_have_their_own_camera(tmp_path: Path) -> None:
+    """EXIF's, or the entry of a file with one for each."""
+    for k, millimetres in enumerate((36, 72)):
+        exif = PIL.Image.Exif()
+        exif.get_ifd(0x8769).update({0xA405: millimetres})
+        PIL.Image.fromarray(picture(k, (600, 400))).save(tmp_path / f"{k}.jpg", exif=exif)
+    fx = [frame.camera.fx for frame in open_frames(str(tmp_path)) if frame.camera is not None]
+    assert fx == pytest.approx([600, 1200])
+    entries = {str(k): {"cam_K": [500 + k, 0, 300, 0, 500, 200, 0, 0, 1]} for k in range(2)}
+    (tmp_path / "cameras.json").write_text(json.dumps(entries))
+    fx = [f.camera.fx for f in open_frames(str(tmp_path), tmp_path / "cameras.json") if f.camera is not None]
+    assert fx == [500, 501]
+
+
+def test_frames_are_undistorted(tmp_path: Path) -> None:
+    lens = {"fx": 100, "fy": 100, "cx": 48, "cy": 32, "distortion_coefficients": [-0.3, 0.1, 0, 0]}
+    (tmp_path / "lens.json").write_text(json.dumps(lens))
+    for frame in open_frames(str(video(tmp_path / "a.mp4", 2)), tmp_path / "lens.json"):
+        assert frame.image is not None and frame.camera is not None
+        assert frame.camera.width > SIZE[0] and frame.image.shape[:2] == frame.camera.size[::-1]
 
 
 def test_a_scene_has_a_camera_for_each_picture(tmp_path: Path) -> None:

@@ -162,6 +162,93 @@ def test_masks_are_what_is_not_black(tmp_path: Path, kind: str) -> None:
     assert load_mask(tmp_path / "m.png").dtype == np.bool_
 
 
+def disc(soft: float = 0.0) -> np.ndarray:
+    """A disc of 255 on 0, (480, 640), its rim smoothed over so many pixels."""
+    x, y = np.meshgrid(np.arange(640), np.arange(480))
+    distance = 150 - np.hypot(x - 300, y - 250)
+    return (np.clip(distance / max(soft, 1e-9) + 0.5, 0, 1) * 255).astype(np.uint8)
+
+
+def test_masks_of_jpeg_are_cut_at_half(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    Image.fromarray(disc()).save(tmp_path / "m.jpg", quality=60)
+    mask = load_mask(tmp_path / "m.jpg")
+    assert abs(int(mask.sum()) - int((disc() > 0).sum())) < 0.005 * mask.sum()
+    assert "the mask m.jpg has values between 0 and 255" in caplog.text
+
+
+@pytest.mark.parametrize("most", [255, 200, 65535, 4095])
+def test_soft_masks_are_cut_at_half_of_their_brightest(tmp_path: Path, most: int) -> None:
+    soft = disc(20.0).astype(np.float64) / 255 * most
+    png(tmp_path / "m.png", soft.astype(np.uint8 if most < 256 else np.uint16))
+    assert abs(int(load_mask(tmp_path / "m.png").sum()) - int((disc() > 0).sum())) < 0.01 * (disc() > 0).sum()
+
+
+def test_labels_are_no_mask(tmp_path: Path) -> None:
+    labels = np.zeros((48, 64), np.uint8)
+    labels[3:20, 3:20], labels[30:40, 30:40] = 1, 2
+    with pytest.raises(PromptError, match=r"the mask m.png has the values 1, 2, as a picture of labels does"):
+        load_mask(png(tmp_path / "m.png", labels))
+
+
+def test_an_inverted_mask_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    load_mask(png(tmp_path / "m.png", 255 - disc()))
+    assert "is it inverted" in caplog.text
+
+
+# --- bits, and metadata that are damaged ---
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
+@pytest.mark.parametrize("colours", [False, True])
+def test_bits_in_16_are_scaled_by_what_is_used(
+    tmp_path: Path, bits: int, colours: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    wide = np.rint(PIXELS / 255.0 * ((1 << bits) - 1)).astype(np.uint16)
+    wide[0, 0] = (1 << bits) - 1
+    for suffix in ("png", "tiff"):
+        path = tmp_path / f"a.{suffix}"
+        cv2.imwrite(str(path), wide[..., ::-1] if colours else wide[..., 0])
+        caplog.clear()
+        expected = PIXELS if colours else np.repeat(PIXELS[..., :1], 3, axis=2)
+        found = load_image(path)
+        assert np.abs(found[1:].astype(int) - expected[1:].astype(int)).max() <= 1
+        assert (f"taken for {bits} bits" in caplog.text) == (bits < 16)
+
+
+def jpeg(path: Path, exif: bytes) -> Path:
+    Image.new("RGB", (64, 48), (90, 120, 30)).save(path, exif=b"Exif\0\0" + exif)
+    return path
+
+
+ORIENTATION = struct.pack("<HHII", 0x0112, 3, 1, 6)
+BEYOND = 8 + 2 + 12 * 2 + 4
+
+
+@pytest.mark.parametrize(
+    ("entries", "tail", "turned"),
+    [
+        ([ORIENTATION, struct.pack("<HHII", 0x011A, 10, 1, BEYOND)], struct.pack("<ii", -1, 0), True),
+        ([ORIENTATION, struct.pack("<HHII", 0x011A, 10, 1, BEYOND)], struct.pack("<ii", -72, 1), True),
+        ([ORIENTATION, struct.pack("<HHII", 0x011A, 5, 2, BEYOND)], struct.pack("<IIII", 72, 1, 72, 1), True),
+        ([ORIENTATION, struct.pack("<HHII", 0x8769, 4, 1, 0xFFFFFF)], b"", True),
+        ([struct.pack("<HHII", 0x0112, 2, 4, 0x41414141)] * 2, b"", False),
+        ([struct.pack("<HHII", 0x0112, 3, 1, 99)] * 2, b"", False),
+    ],
+)
+def test_damaged_exif_does_not_stop_a_picture(tmp_path: Path, entries: list[bytes], tail: bytes, turned: bool) -> None:
+    exif = b"II*\0\x08\0\0\0" + struct.pack("<H", len(entries)) + b"".join(entries) + b"\0\0\0\0" + tail
+    assert load_image(jpeg(tmp_path / "a.jpg", exif)).shape == ((64, 48, 3) if turned else (48, 64, 3))
+    assert load_view(tmp_path / "a.jpg").camera.size == ((48, 64) if turned else (64, 48))
+
+
+@pytest.mark.parametrize(
+    "exif", [b"", b"II*\0", b"II*\0\x08\0\0\0\x30\0" + ORIENTATION[:9], b"Exif\0\0MM\0*", b"x" * 30]
+)
+def test_exif_that_is_none(tmp_path: Path, exif: bytes) -> None:
+    assert load_image(jpeg(tmp_path / "a.jpg", exif)).shape == (48, 64, 3)
+    assert load_view(tmp_path / "a.jpg").camera.size == (64, 48)
+
+
 def test_masks_that_do_not_fit(tmp_path: Path) -> None:
     png(tmp_path / "m.png", np.zeros((48, 64), np.uint8))
     with pytest.raises(PromptError, match=r"the mask m.png is 64x48 pixels, the picture 640x480: a mask has the size"):
@@ -255,16 +342,6 @@ def test_opencv_files(tmp_path: Path, suffix: str, key: str) -> None:
     is_k(load_camera(path, VGA))
 
 
-def test_distortion_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    path = tmp_path / "c.yml"
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    storage.write("K", K)
-    storage.write("D", np.array([0.1, -0.2, 0, 0]))
-    storage.release()
-    is_k(load_camera(path, VGA))
-    assert "the camera has lens distortion (0.1, -0.2, 0, 0)" in caplog.text
-
-
 def test_scene_camera_by_the_pictures_number(tmp_path: Path) -> None:
     path = tmp_path / "scene_camera.json"
     other = (K * [[2], [2], [1]]).ravel().tolist()
@@ -313,7 +390,7 @@ def test_a_principal_point_outside_is_told(caplog: pytest.LogCaptureFixture) -> 
         ("k.txt", "1 2 3", "3x3 numbers, not 3"),
         ("k.txt", "focal length: long", "holds no camera"),
         ("k.txt", "", "3x3 numbers, not 0"),
-        ("c.yml", "%YAML:1.0\n---\nother: 3\n", "it has none of camera_matrix"),
+        ("c.yml", "%YAML:1.0\n---\nother: 3\n", "nor any of camera_matrix"),
         ("c.yml", "%YAML:1.0\n---\n\t: : :", "holds no camera"),
     ],
 )

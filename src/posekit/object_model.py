@@ -7,6 +7,7 @@ import io
 import json
 import logging
 import re
+import urllib.parse
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -23,11 +24,14 @@ from scipy.spatial.distance import pdist
 
 from posekit.errors import MeshError
 from posekit.geometry import Pose, fibonacci_sphere, so3_exp
+from posekit.mesh_files import ply_colours, ply_faces, put_right
+from posekit.pixels import deep_colour, eight_bit
 
 log = logging.getLogger("posekit")
+logging.getLogger("trimesh").addHandler(logging.NullHandler())  # what is wrong is said by errors and notes here
 
 FORMATS = (".ply", ".obj", ".glb", ".gltf", ".stl")
-UNITS = {"mm": 0.001, "m": 1.0}
+UNITS = {"mm": 0.001, "cm": 0.01, "m": 1.0, "in": 0.0254}
 
 _METRES_BELOW, _MM_ABOVE = 3.0, 20.0  # diameters in a file's own units; between them nobody can tell
 _SMALLEST, _LARGEST = 0.001, 10.0  # diameters in metres that are an object's
@@ -161,7 +165,7 @@ class ObjectModel:
     vertices: float32 (V, 3). faces: int32 (F, 3). normals: float32 (V, 3), unit.
     colors: uint8 (V, 3) or None. uvs: float32 (V, 2) or None, v up as in OpenGL and OBJ.
     texture: uint8 RGB (H, W, 3) or None; where it is set, uvs is too and colors is None.
-    units: those of the file it came from, "mm" or "m".
+    units: those of the file it came from, "mm", "cm", "m" or "in".
     """
 
     name: str
@@ -185,7 +189,8 @@ class ObjectModel:
     def load(cls, path: str | Path, units: str = "auto", symmetry: str | Symmetries | None = None) -> ObjectModel:
         """Read a PLY, OBJ (with MTL and textures), GLB, glTF or STL file.
 
-        units: "mm", "m", or "auto": metres where the diameter is below 3, millimetres where it is above 20.
+        units: "mm", "cm", "m", "in" (inches), or "auto": metres where the diameter is below 3, millimetres where it is
+        above 20; what is taken is said, with the object's length.
         symmetry: a text for `Symmetries.parse`, a JSON file's name, or symmetries; otherwise they are read from a
         ``models_info.json`` beside the mesh (``obj_000009.ply`` by its number, other names by their stem).
 
@@ -195,7 +200,7 @@ class ObjectModel:
         """
         path = Path(path)
         if units not in ("auto", *UNITS):
-            raise MeshError(f"units are auto, mm or m, not {units!r}.")
+            raise MeshError(f"units are auto, {', '.join(UNITS)}, not {units!r}.")
         merged = _merge(_read(path), path.name)
         model = cls.from_arrays(
             merged.vertices,
@@ -520,27 +525,54 @@ class _Assets(trimesh.resolvers.FilePathResolver):
 
     def get(self, name: str) -> bytes:
         name = str(name).strip().strip('"').replace("\\", "/")
-        # an MTL file may have options before the picture's name
-        candidates = [name, name.split()[-1]] if name.startswith("-") else [name]
-        found = next((p for p in (self.folder / c for c in candidates) if p.is_file()), None)
+        found = next((path for path in map(self._inside, _spellings(name)) if path is not None), None)
         if found is None:
+            wanted = Path(_spellings(name)[-1]).name
             self.problem = self.problem or (
-                f"names the file {name!r}, which is not there: put it at {self.folder / candidates[-1]}, "
+                f"names the file {name!r}, which is not there: put it at {self.folder / wanted}, "
                 "or export the mesh without materials"
             )
             raise FileNotFoundError(name)
         data = found.read_bytes()
-        if found.suffix.lower() not in (".mtl", ".bin"):
-            try:
-                with Image.open(io.BytesIO(data)) as image:
-                    image.load()
-            except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-                self.problem = self.problem or f"has the texture {found}, which is not a readable picture ({error})"
-                raise
-        return data
+        if found.suffix.lower() in (".mtl", ".bin"):
+            return data
+        try:
+            with Image.open(io.BytesIO(data)) as image:
+                image.load()
+        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+            self.problem = self.problem or f"has the texture {found}, which is not a readable picture ({error})"
+            raise
+        deep = deep_colour(data)
+        if deep is None:
+            return data
+        file = io.BytesIO()
+        Image.fromarray(eight_bit(deep, found.name)).save(file, "png")
+        return file.getvalue()
+
+    def _inside(self, name: str) -> Path | None:
+        """The file of a name in the mesh's folder or below it, also spelled with other capitals; None without one."""
+        folder, path = self.folder.resolve(), self.folder / name
+        try:
+            if path.is_file() and path.resolve().is_relative_to(folder):
+                return path
+            parent = path.parent
+            if not parent.is_dir() or not parent.resolve().is_relative_to(folder):
+                return None
+            same = [other for other in parent.iterdir() if other.name.lower() == path.name.lower() and other.is_file()]
+        except (OSError, ValueError):
+            return None  # a name that no file can have
+        return same[0] if len(same) == 1 and same[0].resolve().is_relative_to(folder) else None
 
     def namespaced(self, namespace: str) -> _Assets:
         return _Assets(self.folder / namespace / "mesh")
+
+
+def _spellings(name: str) -> list[str]:
+    """What a file may be called that a mesh names: as it stands, without an MTL's options before it, %20 decoded, and
+    its base name alone, of paths on other machines."""
+    plain = [name, name.split()[-1]] if name.startswith("-") and name.split() else [name]
+    decoded = [urllib.parse.unquote(each) for each in plain]
+    return list(dict.fromkeys([*plain, *decoded, *(each.rsplit("/", 1)[-1] for each in decoded)]))
 
 
 def _read(path: Path) -> list[_Part]:
@@ -560,7 +592,11 @@ def _read(path: Path) -> list[_Part]:
     assets = _Assets(path)
     try:
         loaded = trimesh.load(
-            io.BytesIO(data), file_type=kind[1:], resolver=assets, process=False, **_reading_options(path, data)
+            io.BytesIO(put_right(kind, data, path.name)),
+            file_type=kind[1:],
+            resolver=assets,
+            process=False,
+            **_reading_options(path, data),
         )
         scene = loaded if isinstance(loaded, trimesh.Scene) else trimesh.Scene(loaded)
         problem = assets.problem
@@ -578,11 +614,6 @@ def _read(path: Path) -> list[_Part]:
 def _reading_options(path: Path, data: bytes) -> dict[str, Any]:
     """What trimesh has to be told about a file's contents."""
     kind = path.suffix.lower()
-    if kind == ".obj" and re.search(rb"^f[^\n]*[\s/]-\d", data, re.MULTILINE):
-        raise MeshError(
-            f"{path.name} counts vertices from the end (negative face indices), which posekit does not read: "
-            "export it with absolute indices, or as PLY or GLB."
-        )
     if kind == ".ply":
         # texture coordinates at a face's corners need vertices split; at vertices they must stay as they are
         return {"fix_texture": b" texcoord" in data[: data.find(b"end_header")]}
@@ -613,18 +644,36 @@ def _part(mesh: Any, label: str) -> _Part:
     # trimesh computes normals on demand, but from split seams; only the file's own are wanted
     has_normals = "vertex_normals" in mesh._cache.cache
     normals = np.asarray(mesh.vertex_normals, dtype=np.float64) if has_normals else None
+    elements = mesh.metadata.get("_ply_raw")
+    sources = np.arange(len(faces))
+    if elements is not None and (cut := ply_faces(elements, vertices, label)) is not None:
+        faces, sources = cut
     part = _Part(vertices, faces, normals)
     visual = mesh.visual
+    if elements is not None and visual.kind != "texture":
+        colors = ply_colours(elements.get("vertex"), len(vertices), label)
+        if colors is not None:
+            return replace(part, colors=colors)
+        colors = ply_colours(elements.get("face"), elements["face"]["length"], label)
+        return part if colors is None else _faceted(part, colors[sources])
     if visual.kind == "texture":
         return _with_material(part, mesh, label)
     if visual.kind == "vertex":
         return replace(part, colors=np.asarray(visual.vertex_colors)[:, :3].astype(np.uint8))
     if visual.kind == "face":
-        colors = np.repeat(np.asarray(visual.face_colors)[:, :3], 3, axis=0).astype(np.uint8)
-        corners = faces.ravel()
-        return _Part(vertices[corners], np.arange(len(corners)).reshape(-1, 3),
-                     None if normals is None else normals[corners], colors)  # fmt: skip
+        return _faceted(part, np.asarray(visual.face_colors)[:, :3].astype(np.uint8))
     return part
+
+
+def _faceted(part: _Part, colors: NDArray[np.uint8]) -> _Part:
+    """The part with a colour for each face (F, 3): no two faces share a vertex."""
+    corners = part.faces.ravel()
+    return _Part(
+        part.vertices[corners],
+        np.arange(len(corners)).reshape(-1, 3),
+        None if part.normals is None else part.normals[corners],
+        np.repeat(colors, 3, axis=0),
+    )
 
 
 def _with_material(part: _Part, mesh: Any, label: str) -> _Part:
@@ -638,7 +687,9 @@ def _with_material(part: _Part, mesh: Any, label: str) -> _Part:
     if factor is None and "kd" in getattr(material, "kwargs", {}):  # MTL
         factor = material.diffuse
     if image is not None and uvs is not None and len(uvs) == count:
-        texture = np.asarray(image.convert("RGB"), dtype=np.uint8)
+        deep = image.mode.startswith("I")  # 16 bits of grey
+        grey = eight_bit(np.asarray(image).astype(np.int64), label) if deep else None
+        texture = np.asarray((image if grey is None else Image.fromarray(grey)).convert("RGB"), dtype=np.uint8)
         if factor is not None and not hasattr(material, "image"):  # in MTL files Kd beside a texture is mostly noise
             texture = np.rint(texture * (np.asarray(factor, dtype=np.float64)[:3] / 255.0)).astype(np.uint8)
         return replace(part, uvs=np.asarray(uvs, dtype=np.float64), texture=texture)
@@ -646,22 +697,13 @@ def _with_material(part: _Part, mesh: Any, label: str) -> _Part:
         log.warning("%s: a part has a texture but no texture coordinates; it gets its material's one colour.", label)
     colors = mesh.visual.vertex_attributes.get("color")
     if colors is None and "_ply_raw" in mesh.metadata:
-        colors = _ply_colors(mesh.metadata["_ply_raw"]["vertex"]["data"], count)
+        colors = ply_colours(mesh.metadata["_ply_raw"].get("vertex"), count, label)
     if colors is not None and len(colors) == count:
         return replace(part, colors=np.asarray(trimesh.visual.color.to_rgba(colors))[:, :3].astype(np.uint8))
     if factor is None:
         log.warning("%s: a part has texture coordinates but no texture and no colour; it is drawn grey.", label)
         return part
     return replace(part, colors=np.tile(np.asarray(factor)[:3].astype(np.uint8), (count, 1)))
-
-
-def _ply_colors(data: Any, count: int) -> NDArray[Any] | None:
-    """Vertex colours of a PLY file that has texture coordinates too, but no texture; trimesh leaves them out."""
-    try:
-        colors = np.column_stack([np.ravel(data[name]) for name in ("red", "green", "blue")])
-    except (KeyError, ValueError):
-        return None
-    return colors if len(colors) == count else None
 
 
 def _placed(part: _Part, transform: Floats) -> _Part:
@@ -795,30 +837,41 @@ def _resized(picture: NDArray[np.uint8], scale: float) -> NDArray[np.uint8]:
 
 
 def _chosen_units(label: str, diameter: float, units: str) -> str:
-    """ "mm" or "m". Raises MeshError where nobody can tell, or where the size is no object's."""
+    """One of UNITS. Raises MeshError where nobody can tell, or where the size is no object's."""
     if units == "auto":
         if _METRES_BELOW <= diameter <= _MM_ABOVE:
+            could_be = "; ".join(f"{unit}: {_plain_length(diameter * UNITS[unit])} long" for unit in UNITS)
             raise MeshError(
                 f"{label} has a diameter of {diameter:.3g} in its own units, which could be metres or millimetres: "
-                "pass --units m or --units mm."
+                f"pass --units m or --units mm, or another ({could_be})."
             )
         chosen = "m" if diameter < _METRES_BELOW else "mm"
     else:
         chosen = units
     if not _plausible(diameter, chosen):
-        other = "m" if chosen == "mm" else "mm"
-        if _plausible(diameter, other):
-            advice = f"posekit works in metres: pass --units {other}."
+        fitting = [unit for unit in ("m", "mm", "cm", "in") if unit != chosen and _plausible(diameter, unit)]
+        if fitting:
+            advice = f"posekit works in metres: pass --units {' or --units '.join(fitting)}."
         else:
             advice = "posekit works with objects from 1 mm to 10 m: scale the mesh."
         raise MeshError(f"{label} has a diameter of {diameter:.3g} {chosen}; {advice}")
     if units == "auto":
         name = {"mm": "millimetres", "m": "metres"}[chosen]
+        others = [unit for unit in UNITS if unit != chosen and _plausible(diameter, unit)]
         log.info(
-            "%s: a diameter of %.4g, so its units are taken for %s (--units %s says so without asking).",
-            label, diameter, name, chosen,
+            "%s: a diameter of %.4g, so its units are taken for %s: the object is %s long (--units %s says so without "
+            "asking%s).",
+            label, diameter, name, _plain_length(diameter * UNITS[chosen]), chosen,
+            "".join(f"; --units {unit} makes it {_plain_length(diameter * UNITS[unit])}" for unit in others),
         )  # fmt: skip
     return chosen
+
+
+def _plain_length(metres: float) -> str:
+    """A length as people say it: 27 mm, 12.5 cm, 1.8 m."""
+    if metres < 0.1:
+        return f"{metres * 1000:.3g} mm"
+    return f"{metres * 100:.3g} cm" if metres < 1 else f"{metres:.3g} m"
 
 
 def _plausible(diameter: float, units: str) -> bool:
@@ -841,7 +894,7 @@ def _symmetries(given: str | Symmetries | None, path: Path, model: ObjectModel) 
 def _symmetries_from_file(file: Path, mesh: Path) -> Symmetries:
     """The entry for a mesh in a file of models_info.json's form, or of an entry's own form (mm)."""
     try:
-        data = json.loads(file.read_text(encoding="utf-8"))
+        data = json.loads(file.read_text(encoding="utf-8-sig"))
         if not isinstance(data, dict):
             raise ValueError("its outermost part is not {...}")
         number = re.fullmatch(r"obj_(\d+)", mesh.stem)

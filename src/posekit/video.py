@@ -5,6 +5,8 @@ from __future__ import annotations
 import glob
 import json
 import logging
+import math
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -19,9 +21,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from posekit.calibration import Calibration, depends_on_picture, load_calibration
 from posekit.camera import Camera
 from posekit.errors import ImageError, InputError, OutputError
-from posekit.load import ASSUMED_FOV, load_camera, load_image
+from posekit.load import ASSUMED_FOV, camera_from_exif, load_image
 
 log = logging.getLogger("posekit")
 
@@ -35,8 +38,9 @@ MOST_FAILURES = 100  # frames of a camera or video that may fail one after the o
 @dataclass(frozen=True, eq=False)
 class Frame:
     """number: in the source, from 0, or the picture's own in a BOP scene. image: uint8 RGB (H, W, 3), None where it
-    could not be decoded, and ``problem`` says why. camera: of this frame, where it is known. seconds: since the start,
-    where known. scene: of a BOP scene, else 0."""
+    could not be decoded, and ``problem`` says why. camera: of this frame, where it is known; where it has lens
+    distortion, image and camera are the undistorted ones. seconds: since the start, where known. scene: of a BOP scene,
+    else 0. file: the picture's name, where it is one."""
 
     number: int
     image: Image | None
@@ -44,6 +48,7 @@ class Frame:
     seconds: float | None = None
     problem: str = ""
     scene: int = 0
+    file: str = ""
 
 
 class Frames(Protocol):
@@ -62,7 +67,8 @@ def open_frames(source: str, camera: str | Path | None = None) -> Frames:
     """A source of frames by its name.
 
     source: a video file, a folder of pictures, a glob of them, a BOP scene (a folder with scene_camera.json), or the
-    number of a camera. camera: as `load_camera` takes it; else a BOP scene's own, else a field of view of 60 degrees.
+    number of a camera. camera: as `load_calibration` takes it; else a BOP scene's own, else a picture's EXIF data, else
+    a field of view of 60 degrees. Pictures come in the order of the numbers in their names.
     Raises InputError where there is no such thing or nothing in it, ImageError where a video cannot be opened.
     """
     if source.isdigit() and not Path(source).exists():
@@ -82,35 +88,54 @@ def open_frames(source: str, camera: str | Path | None = None) -> Frames:
 
 
 def _pictures(paths: Any, source: str) -> list[Path]:
-    found = sorted(path for path in paths if path.suffix.lower() in PICTURES)
+    found = sorted((path for path in paths if path.suffix.lower() in PICTURES), key=_natural)
     if not found:
         raise InputError(f"{source} holds no pictures ({', '.join(PICTURES)}).")
     return found
 
 
+def _natural(path: Path) -> list[tuple[int, int, str]]:
+    """Numbers in a name count as numbers: frame_2 comes before frame_10."""
+    parts = re.split(r"([0-9]+)", path.name.lower())
+    return [(int(part), len(part), "") if k % 2 else (-1, 0, part) for k, part in enumerate(parts)]
+
+
 class _Intrinsics:
-    """The camera of each frame, by its size; told once where it is assumed."""
+    """The camera of each frame: by its size where it is given, of pictures by their EXIF data else; told once."""
 
     def __init__(self, camera: str | Path | None) -> None:
-        self.given, self.known = camera, dict[tuple[int, int], Camera]()
+        self.given, self.known = camera, dict[tuple[Any, ...], Calibration]()
+        self.each = camera is not None and depends_on_picture(camera)
+        self.told = False
 
-    def of(self, image: Image, path: Path | None = None) -> Camera:
-        """Raises CameraError where the given camera does not fit the picture's shape."""
-        size = (image.shape[1], image.shape[0])
-        if size not in self.known:
-            if self.given is not None:
-                self.known[size] = load_camera(self.given, size, path)
-            else:
-                self.known[size] = Camera.from_fov(ASSUMED_FOV, *size)
-                log.warning(
-                    "the camera is not known, so a field of view of 60 degrees is assumed: distances may be wrong by "
-                    "tens of percent. Pass --camera fx,fy,cx,cy or a calibration file."
-                )
-        return self.known[size]
+    def seen(self, image: Image, path: Path | None = None) -> tuple[Image, Camera]:
+        """The undistorted picture and its camera. Raises CameraError where the given camera does not fit."""
+        found = self._of((image.shape[1], image.shape[0]), path)
+        return found.undistorted(image), found.ideal
+
+    def _of(self, size: tuple[int, int], path: Path | None) -> Calibration:
+        if self.given is not None:
+            key = (size, path if self.each else None)
+            if key not in self.known:
+                self.known[key] = load_calibration(self.given, size, path)
+            return self.known[key]
+        exif = camera_from_exif(path, size) if path is not None else None
+        if exif is not None and path is not None:
+            if not self.told:
+                log.info("%s: focal length %.0f pixels, from its EXIF data.", path.name, exif.fx)
+            self.told = True
+            return Calibration(exif)
+        if (size,) not in self.known:
+            self.known[(size,)] = Calibration(Camera.from_fov(ASSUMED_FOV, *size))
+            log.warning(
+                "the camera is not known, so a field of view of 60 degrees is assumed: distances may be wrong by "
+                "tens of percent. Pass --camera fx,fy,cx,cy or a calibration file."
+            )
+        return self.known[(size,)]
 
 
 class PictureFrames:
-    """Pictures in the order of their names."""
+    """Pictures in the order of the numbers in their names."""
 
     rate = RATE
 
@@ -120,10 +145,10 @@ class PictureFrames:
     def __iter__(self) -> Iterator[Frame]:
         for number, path in enumerate(self.paths):
             try:
-                image = load_image(path)
-                yield Frame(number, image, self._cameras.of(image, path), number / self.rate)
+                image, camera = self._cameras.seen(load_image(path), path)
+                yield Frame(number, image, camera, number / self.rate, file=path.name)
             except InputError as error:
-                yield Frame(number, None, problem=str(error))
+                yield Frame(number, None, problem=str(error), file=path.name)
 
 
 class SceneFrames:
@@ -133,9 +158,9 @@ class SceneFrames:
 
     def __init__(self, folder: Path) -> None:
         try:
-            cameras = json.loads((folder / "scene_camera.json").read_text(encoding="utf-8"))
+            cameras = json.loads((folder / "scene_camera.json").read_text(encoding="utf-8-sig"))
             self.cameras: Mapping[int, Any] = {int(k): v for k, v in sorted(cameras.items(), key=lambda kv: int(kv[0]))}
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, AttributeError) as error:
             raise InputError(f"{folder / 'scene_camera.json'} cannot be read: {error}.") from error
         self.folder, self.count = folder, len(self.cameras)
         self.scene = int(folder.name) if folder.name.isdigit() else 0
@@ -145,18 +170,18 @@ class SceneFrames:
     def __iter__(self) -> Iterator[Frame]:
         for place, (number, entry) in enumerate(self.cameras.items()):
             try:
-                image = load_image(self._path(number))
+                path = self._path(number)
+                image = load_image(path)
                 camera = Camera.from_K(np.reshape(entry["cam_K"], (3, 3)), image.shape[1], image.shape[0])
-                yield Frame(number, image, camera, place / self.rate, scene=self.scene)
-            except (InputError, KeyError, ValueError) as error:
+                yield Frame(number, image, camera, place / self.rate, scene=self.scene, file=path.name)
+            except (InputError, KeyError, ValueError, TypeError) as error:
                 yield Frame(number, None, problem=str(error), scene=self.scene)
 
     def _path(self, number: int) -> Path:
-        for kind in ("rgb", "gray"):
-            for suffix in PICTURES:
-                path = self.folder / kind / f"{number:06d}{suffix}"
-                if path.is_file():
-                    return path
+        names = dict.fromkeys((f"{number:06d}", str(number)))
+        for path in (self.folder / k / (n + s) for n in names for k in ("rgb", "gray") for s in PICTURES):
+            if path.is_file():
+                return path
         raise ImageError(f"the scene {self.folder} has no picture {number:06d} in rgb.")
 
 
@@ -191,7 +216,7 @@ class VideoFrames:
                     continue
                 for found in decoded:
                     failures = 0
-                    image = found.to_ndarray(format="rgb24")
+                    image = _turned(found.to_ndarray(format="rgb24"), _rotation(found))
                     start = found.time if start is None else start
                     seconds = None if found.time is None or start is None else found.time - start
                     yield self._frame(number, image, seconds)
@@ -199,9 +224,22 @@ class VideoFrames:
 
     def _frame(self, number: int, image: Image, seconds: float | None) -> Frame:
         try:
-            return Frame(number, image, self._cameras.of(image), seconds)
+            return Frame(number, *self._cameras.seen(image), seconds)
         except InputError as error:  # the size changed to another shape
             return Frame(number, None, seconds=seconds, problem=f"frame {number}: {error}")
+
+
+def _rotation(frame: Any) -> float:
+    """Degrees counter-clockwise by which a player turns a frame: the display matrix that phones write."""
+    return float(getattr(frame, "rotation", 0) or 0)
+
+
+def _turned(image: Image, degrees: float) -> Image:
+    """Raises ImageError where it is no quarter turn: no player shows such a video unframed."""
+    quarters = round(degrees / 90)
+    if not math.isclose(degrees, 90 * quarters, abs_tol=1):
+        raise ImageError(f"its frames are to be turned by {degrees:g} degrees: write it anew, upright, with ffmpeg.")
+    return np.ascontiguousarray(np.rot90(image, quarters))
 
 
 def _opened(path: Path) -> Any:
@@ -241,7 +279,7 @@ class CameraFrames:
                 failures = 0 if ok else failures + 1
                 if ok:
                     image = np.asarray(bgr[..., ::-1].copy(), np.uint8)
-                    yield Frame(number, image, self._cameras.of(image))
+                    yield Frame(number, *self._cameras.seen(image))
                 else:
                     yield Frame(number, None, problem=f"{self.label} gave no frame")
                 number += 1

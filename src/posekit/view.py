@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from posekit.camera import Camera, Zoom
+from posekit.lens import Lens
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,6 +20,7 @@ class View:
     mask: bool (H, W), the object's pixels. depth: float32 (H, W), metres along z, 0 = nothing.
     coords: float32 (H, W, 3), object coordinates in metres, 0 = nothing.
     R_view_cam: (3, 3), from the photograph's camera frame into this view's (identity unless zoomed).
+    lens: where this is an undistorted photograph, the lens that it was taken through.
     """
 
     image: NDArray[np.uint8]
@@ -27,6 +29,7 @@ class View:
     depth: NDArray[np.float32] | None = None
     coords: NDArray[np.float32] | None = None
     R_view_cam: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
+    lens: Lens | None = None
 
     def __post_init__(self) -> None:
         size = (self.camera.height, self.camera.width)

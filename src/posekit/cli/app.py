@@ -6,9 +6,13 @@ Commands import what they need when they run, so that ``posekit --help`` loads n
 from __future__ import annotations
 
 import logging
+import shlex
+import sys
+import traceback
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -36,6 +40,25 @@ class Commands(TyperGroup):
         except KeyboardInterrupt as error:
             _tell("interrupted", "nothing more is written", typer.colors.RED)
             raise typer.Exit(INTERRUPTED) from error
+        except Exception as error:  # a fault of posekit or of a library: said like any other, with what to report
+            framework = type(error).__module__.partition(".")[0] in ("typer", "click")  # wrong usage, an exit
+            if framework or ctx.params.get("debug") or isinstance(error, BrokenPipeError):
+                raise
+            _tell("error", _unexpected(error), typer.colors.RED)
+            raise typer.Exit(1) from error
+
+
+def _unexpected(error: Exception) -> str:
+    """What nobody foresaw: where it happened, with what, and how to report it."""
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if "posekit" in Path(frame.filename).parts]
+    place = f" in {Path(own[-1].filename).name}, line {own[-1].lineno}" if own else ""
+    reason = " ".join(str(error).split())[:300]
+    return (
+        f"something unexpected{place} ({type(error).__name__}: {reason}) while working on: posekit "
+        f"{' '.join(map(shlex.quote, sys.argv[1:]))}. This is a fault of posekit {__version__}: please report it with "
+        "this line, the files if they may be shared, and what posekit --debug prints."
+    )
 
 
 @contextmanager

@@ -100,7 +100,7 @@ def estimate(
     )
     view = load_view(image, camera)
     meshes = [ObjectModel.load(path, units=units, symmetry=symmetry) for path in model]
-    finder = prompt_for(box, mask, mask_from, detections, image)
+    finder = prompt_for(box, mask, mask_from, detections, image, view.lens)
     asked = finder is not None
     if finder is None:
         from posekit.novel import make_detector

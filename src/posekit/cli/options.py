@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-Units = Literal["auto", "mm", "m"]
+Units = Literal["auto", "mm", "cm", "m", "in"]
 Update = Literal["correspondence", "regression"]
 Stop = Literal["angle", "fixed"]
 MaskFrom = Literal["none", "grabcut", "filled"]

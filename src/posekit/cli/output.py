@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -40,6 +41,7 @@ class OutputFolder:
             raise OutputError(f"{self.path} is a file: --out names a folder.")
         if occupied and not self.force:
             raise OutputError(f"the folder {self.path} holds files: pass --force to write into it, or another --out.")
+        _check_writable(self.path, f"the output folder {self.path} cannot be written")
 
     def write(self, name: str, data: bytes | str) -> Path:
         """Write one file, whole or not at all, and return its path."""
@@ -53,6 +55,21 @@ class OutputFolder:
         else:
             write_bytes_atomic(path, data)
         return path
+
+
+def _check_writable(folder: Path, trouble: str) -> None:
+    """Whether a file can be made in a folder, or the folder in the nearest one that is there: by trying. Raises
+    OutputError."""
+    there = folder
+    while not there.exists() and there != there.parent:
+        there = there.parent
+    try:
+        if not there.is_dir():
+            raise NotADirectoryError(20, f"{there} is a file")
+        with TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        raise OutputError(f"{trouble}: {error.strerror}. Choose another place, or change its permissions.") from error
 
 
 @dataclass(frozen=True)
@@ -72,6 +89,7 @@ class Destination:
                 raise OutputError(f"--json {json} is a folder: give a file, or - for standard output.")
             if not Path(json).parent.is_dir():
                 raise OutputError(f"--json {json}: there is no folder {Path(json).parent}. Make it first.")
+            _check_writable(Path(json).parent, f"--json {json} cannot be written")
         if out is None and json is not None:
             return cls(None, json)
         return cls(OutputFolder(out or default, force), json)
@@ -144,13 +162,17 @@ def _result(
     view: View, results: Sequence[tuple[PoseEstimator, Sequence[Estimate]]], files: Sequence[Mapping[str, Path]]
 ) -> str:
     """The entries of one mesh as they are; of several, ``mesh`` lists them."""
-    camera = view.camera
+    camera, lens = view.camera, view.lens
     about: dict[str, object] = dict(files[0])
+    seen_by: dict[str, object] = {"K": camera.K, "width": camera.width, "height": camera.height}
+    if lens is not None:  # boxes, masks and overlays are of the undistorted picture
+        taken = {"K": lens.camera.K, "width": lens.camera.width, "height": lens.camera.height}
+        seen_by["undistorted_from"] = {**taken, "model": lens.model, "distortion_coefficients": list(lens.coefficients)}
     if len(files) > 1:
         about["mesh"] = [each["mesh"] for each in files]
     return estimates_to_json(
         [estimate for _, estimates in results for estimate in estimates],
         weights_hash=results[0][0].weights_hash,
         versions={name: version(name) for name in ("torch", "numpy", "opencv-python-headless", "moderngl")},
-        about={**about, "camera": {"K": camera.K, "width": camera.width, "height": camera.height}},
+        about={**about, "camera": seen_by},
     )

@@ -7,27 +7,40 @@ from pathlib import Path
 from posekit.cli.options import MaskFrom
 from posekit.detect import BoxPrompt, Detector, MaskPrompt
 from posekit.errors import PromptError
+from posekit.lens import Lens
 from posekit.load import load_mask, parse_box
 
 
-def detector_for(box: str | None, mask: Path | None, mask_from: MaskFrom) -> Detector:
-    """Raises PromptError where neither is given, or both are."""
-    found = prompt_for(box, mask, mask_from)
+def detector_for(box: str | None, mask: Path | None, mask_from: MaskFrom, lens: Lens | None = None) -> Detector:
+    """As `prompt_for`. Raises PromptError where neither is given, or both are."""
+    found = prompt_for(box, mask, mask_from, lens=lens)
     if found is None:
         raise PromptError("where is the object? Pass --box x0,y0,x1,y1 (pixels) or --mask PNG.")
     return found
 
 
 def prompt_for(
-    box: str | None, mask: Path | None, mask_from: MaskFrom, detections: Path | None = None, image: Path | None = None
+    box: str | None,
+    mask: Path | None,
+    mask_from: MaskFrom,
+    detections: Path | None = None,
+    image: Path | None = None,
+    lens: Lens | None = None,
 ) -> Detector | None:
-    """What a person or a file says; None where nothing does. Raises PromptError where several do."""
+    """What a person or a file says; None where nothing does. Raises PromptError where several do.
+
+    lens: of the photograph that they speak of, where it was undistorted: what they say is moved with it.
+    """
     given = [name for name, value in (("--box", box), ("--mask", mask), ("--detections", detections)) if value]
     if len(given) > 1:
         raise PromptError(f"{' and '.join(given)} were both given; one says where the object is: pass one of them.")
     if mask is not None:
+        if lens is not None:
+            return MaskPrompt(lens.undistorted_mask(load_mask(mask, lens.camera.size)))
         return MaskPrompt(load_mask(mask))
     if box is not None:
+        if lens is not None:
+            return BoxPrompt(lens.undistorted_box(parse_box(box, lens.camera.size)), mask_from)
         return BoxPrompt(parse_box(box), mask_from)
     if detections is not None and image is not None:
         from posekit.detect.external import DetectionsFile

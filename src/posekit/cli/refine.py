@@ -88,7 +88,7 @@ def refine(
     view = load_view(image, camera)
     mesh = ObjectModel.load(model, units=units, symmetry=symmetry)
     if box is not None or mask is not None:
-        [detection] = detector_for(box, mask, mask_from).detect(view, [mesh])
+        [detection] = detector_for(box, mask, mask_from, view.lens).detect(view, [mesh])
         view = view.with_mask(detection.mask)
     with destination.working("loading the networks"):
         estimator = PoseEstimator(mesh, preset=preset, weights=weights, options=options, threads=threads)

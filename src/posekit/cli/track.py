@@ -217,6 +217,7 @@ def _line(frame: Frame, name: str, result: Tracked) -> str:
     pose, angle = result.T_cam_obj, result.angle
     entry: dict[str, Any] = {
         "frame": frame.number,
+        **({"file": frame.file} if frame.file else {}),
         "model": name,
         "state": result.state,
         "T_cam_obj": None if pose is None else pose.matrix.tolist(),

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
+import re
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,7 +25,10 @@ from posekit.load import load_image, load_mask, pose_from_bop
 from posekit.object_model import ObjectModel
 from posekit.view import View
 
-_PICTURES = (("rgb", ".png"), ("rgb", ".jpg"), ("gray", ".png"), ("gray", ".tif"))
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+_MESHES = (".ply", ".obj", ".glb", ".gltf", ".stl")
+
+log = logging.getLogger("posekit")
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +102,7 @@ class BopDataset:
 
     def model_ids(self) -> list[int]:
         """The objects' numbers. Raises MeshError where there are no models."""
-        found = sorted(int(path.stem[4:]) for path in self._models.glob("obj_*.ply") if path.stem[4:].isdigit())
+        found = sorted(_meshes(self._models))
         if not found:
             raise MeshError(f"there are no meshes {self._models}/obj_000001.ply and so on: get the data set's models.")
         return found
@@ -104,18 +110,19 @@ class BopDataset:
     def model(self, obj_id: int) -> ObjectModel:
         """An object's mesh in metres; loaded once."""
         if obj_id not in self._loaded:
-            path = self._models / f"obj_{obj_id:06d}.ply"
-            if not path.is_file():
-                raise MeshError(f"there is no mesh {path} for object {obj_id}; there are {self.model_ids()}.")
-            self._loaded[obj_id] = ObjectModel.load(path, units="mm")
+            path = _meshes(self._models).get(obj_id)
+            if path is None:
+                wanted = self._models / f"obj_{obj_id:06d}.ply"
+                raise MeshError(f"there is no mesh {wanted} for object {obj_id}; there are {self.model_ids()}.")
+            self._loaded[obj_id] = _mesh(path)
         return self._loaded[obj_id]
 
     def measured_model(self, obj_id: int) -> MeasuredModel:
         """What an object's errors are measured with: the mesh in models_eval/ where there is one, as BOP does."""
         if obj_id not in self._measured:
-            fine = self.root / "models_eval" / f"obj_{obj_id:06d}.ply"
-            model = ObjectModel.load(fine, units="mm") if fine.is_file() else self.model(obj_id)
-            folder = fine.parent if fine.is_file() else self._models
+            fine = _meshes(self.root / "models_eval").get(obj_id)
+            model = self.model(obj_id) if fine is None else _mesh(fine)
+            folder = self._models if fine is None else fine.parent
             self._measured[obj_id] = MeasuredModel(model, _diameter(folder / "models_info.json", obj_id, model))
         return self._measured[obj_id]
 
@@ -138,11 +145,21 @@ class BopDataset:
             return None
         try:
             entries = _json(self._targets_file)
-            return [Target(e["scene_id"], e["im_id"], e["obj_id"], e["inst_count"]) for e in entries]
-        except (KeyError, TypeError) as error:
+            if entries and not any("obj_id" in entry for entry in entries):
+                return self._all_of(entries)
+            return [Target(*(int(e[k]) for k in ("scene_id", "im_id", "obj_id", "inst_count"))) for e in entries]
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise InputError(
                 f"{self._targets_file} is no list of targets with scene_id, im_id, obj_id and inst_count: {error!r}."
             ) from error
+
+    def _all_of(self, entries: list[Any]) -> list[Target]:
+        """The targets of BOP'24's lists, which name pictures alone: all annotated objects in them."""
+        targets = []
+        for scene, image in sorted({(int(e["scene_id"]), int(e["im_id"])) for e in entries}):
+            counts = Counter(int(truth["obj_id"]) for truth in self._scene(scene).truths.get(image, ()))
+            targets += [Target(scene, image, obj_id, count) for obj_id, count in sorted(counts.items())]
+        return targets
 
     # --- what is in a photograph ---
 
@@ -154,7 +171,8 @@ class BopDataset:
     def image_path(self, scene: int, image: int) -> Path:
         """Where a photograph lies. Raises InputError where it is missing."""
         folder = self._scene(scene).folder
-        candidates = [folder / kind / f"{image:06d}{suffix}" for kind, suffix in _PICTURES]
+        names = list(dict.fromkeys((f"{image:06d}", str(image), f"{image:04d}", f"{image:05d}")))
+        candidates = [folder / kind / (n + s) for n in names for kind in ("rgb", "gray") for s in _SUFFIXES]
         found = next((path for path in candidates if path.is_file()), None)
         if found is None:
             raise InputError(
@@ -220,9 +238,10 @@ class BopDataset:
 
     def _scene(self, scene: int) -> _Scene:
         if scene not in self._scenes:
-            folder = self.root / self.split / f"{scene:06d}"
-            if not folder.is_dir():
-                raise InputError(f"there is no scene {folder}; there are {self.scenes()}.")
+            split = self.root / self.split
+            folder = next((p for p in sorted(split.iterdir()) if _number(p.name) == scene and p.is_dir()), None)
+            if folder is None:
+                raise InputError(f"there is no scene {split / f'{scene:06d}'}; there are {self.scenes()}.")
             self._scenes[scene] = _Scene(folder)
         return self._scenes[scene]
 
@@ -306,9 +325,46 @@ def _diameter(info: Path, obj_id: int, model: ObjectModel) -> float:
     return diameter
 
 
+def _number(name: str) -> int | None:
+    """A name of digits as a number, with zeros before it or not."""
+    return int(name) if re.fullmatch(r"[0-9]+", name) else None
+
+
+def _meshes(folder: Path) -> dict[int, Path]:
+    """Meshes named obj_000001 and so on, with zeros or not, by number; PLY before the other formats."""
+    found: dict[int, Path] = {}
+    for suffix in _MESHES:
+        for path in sorted(folder.glob(f"obj_*{suffix}")):
+            number = _number(path.stem[4:])
+            if number is not None:
+                found.setdefault(number, path)
+    return found
+
+
+def _mesh(path: Path) -> ObjectModel:
+    """A mesh in BOP's millimetres; in metres where it could not be an object otherwise, which is told."""
+    try:
+        return ObjectModel.load(path, units="mm")
+    except MeshError as error:
+        model = _in_metres(path)
+        if model is None:
+            reason = str(error).partition("; posekit works")[0]
+            raise MeshError(f"{reason}. The meshes of a data set in BOP layout are in mm: scale it.") from error
+    log.warning("%s: BOP's meshes are in mm, which would make it %.3g mm long; it is taken for metres.", path.name,
+                model.diameter)  # fmt: skip
+    return model
+
+
+def _in_metres(path: Path) -> ObjectModel | None:
+    try:
+        return ObjectModel.load(path, units="m")
+    except MeshError:
+        return None
+
+
 def _json(path: Path) -> Any:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError as error:
         raise InputError(f"there is no file {path}: this copy of the data set is not complete.") from error
     except (OSError, ValueError) as error:

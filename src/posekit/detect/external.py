@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -17,6 +18,8 @@ from posekit.errors import PromptError
 from posekit.object_model import ObjectModel
 from posekit.results import Detection
 from posekit.view import View
+
+log = logging.getLogger("posekit")
 
 _FORMS = (
     "a list of {image_id, category_id, score, bbox: [x, y, width, height], segmentation} as BOP and COCO results have "
@@ -35,21 +38,23 @@ class DetectionsFile:
     @classmethod
     def read(cls, path: Path, image: Path) -> DetectionsFile:
         """The entries for a photograph: its number is the last one in its name, as BOP has it; a file about one picture
-        only is taken to be about this one. Raises PromptError."""
+        only is taken to be about this one. Of several scenes the one of the picture's folder counts.
+
+        Entries that cannot be used are skipped and told. Raises PromptError where the file is no detections, or has
+        none for this picture, and says which pictures it has.
+        """
         try:
-            data = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
+            data = json.loads(path.read_text(encoding="utf-8-sig"))
+        except (OSError, ValueError, RecursionError) as error:
             raise PromptError(f"the detections {path} cannot be read ({error}): give {_FORMS}.") from error
         try:
-            entries, names, files = _parts(data)
-            pictures = {entry["image_id"] for entry in entries}
-            _ = [int(entry["category_id"]) for entry in entries]  # every entry has one
-            own = _image_number(image, files)
-            if own in pictures or len(pictures) > 1 or (own is not None and own in files):
-                entries = [entry for entry in entries if entry["image_id"] == own]
-            return cls(entries, names, path.name)
+            every, names, files = _parts(data)
+            entries = [e for k, e in enumerate(every) if _usable(e, k, path.name)]
         except (KeyError, TypeError, AttributeError, ValueError) as error:
             raise PromptError(f"{path} holds no detections ({error!r}): give {_FORMS}.") from error
+        if every and not entries:
+            raise PromptError(f"{path} has {len(every)} entries and none that can be used: give {_FORMS}.")
+        return cls(_of_picture(_of_scene(entries, image, path.name), image, files, path.name), names, path.name)
 
     def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
         """Each model's detections by falling score. A category belongs to the model of its name, or of its number
@@ -57,18 +62,46 @@ class DetectionsFile:
         categories = {int(entry["category_id"]) for entry in self.entries}
         found = []
         for model in models:
-            wanted = {c for c in categories if self.names.get(c) == model.name or c == model_number(model.name)}
+            wanted = {
+                c
+                for c in categories
+                if self.names.get(c, "").lower() == model.name.lower() or c == model_number(model.name)
+            }
             if not wanted and len(models) == 1 and len(categories) == 1:
                 wanted = categories
-            mine = [self._detection(e, view, model) for e in self.entries if int(e["category_id"]) in wanted]
+            if not wanted and self.entries:
+                text = (
+                    f"{self.label} has nothing for {model.name} in this picture, only for the categories "
+                    f"{self._categories(categories)}: name the mesh after its category (NAME.ply, or obj_000005.ply "
+                    "for category 5)."
+                )
+                if len(models) == 1:
+                    raise PromptError(text)
+                log.warning("%s", text)
+            chosen = [(k, e) for k, e in enumerate(self.entries) if int(e["category_id"]) in wanted]
+            mine = [d for k, e in chosen if (d := self._told(k, e, view, model)) is not None]
+            if chosen and not mine:
+                raise PromptError(f"{self.label}: none of its {len(chosen)} detections of {model.name} can be used.")
             found += sorted(mine, key=lambda d: -d.score)
         return found
+
+    def _categories(self, numbers: set[int]) -> str:
+        return ", ".join(f"{n} ({self.names[n]})" if n in self.names else str(n) for n in sorted(numbers))
+
+    def _told(self, k: int, entry: Mapping[str, Any], view: View, model: ObjectModel) -> Detection | None:
+        """The detection, or None where it cannot be used, which is told."""
+        try:
+            return self._detection(entry, view, model)
+        except PromptError as error:
+            log.warning("%s: entry %d for this picture is skipped: %s", self.label, k + 1, error)
+            return None
 
     def _detection(self, entry: Mapping[str, Any], view: View, model: ObjectModel) -> Detection:
         try:
             score = float(entry.get("score", 1.0))
-            mask = decode(entry["segmentation"], view.camera.size) if entry.get("segmentation") else None
-            box = _box(entry["bbox"]) if "bbox" in entry else None
+            taken = view.camera if view.lens is None else view.lens.camera
+            mask = decode(entry["segmentation"], taken.size) if entry.get("segmentation") else None
+            box = _box(entry["bbox"]) if entry.get("bbox") is not None else None
         except (KeyError, TypeError, ValueError) as error:
             raise PromptError(f"{self.label} has an entry that is no detection ({error!r}): give {_FORMS}.") from error
         if mask is not None and not mask.any():
@@ -77,16 +110,68 @@ class DetectionsFile:
             box = mask_box(mask) if mask is not None else None
         if box is None or not math.isfinite(score):
             raise PromptError(f"{self.label} has a detection with neither box nor mask, or without a finite score.")
+        if view.lens is not None:
+            box = view.lens.undistorted_box(clip_box(box, taken))
+            mask = None if mask is None else view.lens.undistorted_mask(mask)
         return Detection(clip_box(box, view.camera), mask, score, model.name, "file")
 
 
-def _parts(data: Any) -> tuple[list[Mapping[str, Any]], dict[int, str], dict[int, str]]:
+def _parts(data: Any) -> tuple[list[Any], dict[int, str], dict[int, str]]:
     """Entries, names of categories, and file names of pictures, by number."""
     if isinstance(data, list):
         return data, {}, {}
+    if "annotations" not in data and data and all(str(key).isdigit() for key in data):  # by picture
+        return [{"image_id": key, **entry} for key, entries in data.items() for entry in entries], {}, {}
     names = {int(c["id"]): str(c.get("name", "")) for c in data.get("categories", [])}
     files = {int(i["id"]): str(i.get("file_name", "")) for i in data.get("images", [])}
-    return data["annotations"], names, files
+    return list(data["annotations"]), names, files
+
+
+def _usable(entry: Any, k: int, label: str) -> bool:
+    """Whether an entry names its picture and its category; told where not."""
+    try:
+        int(entry["category_id"]), int(entry["image_id"])
+        if entry.get("scene_id") is not None:
+            int(entry["scene_id"])
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        reason = f"it has no {error}" if isinstance(error, KeyError) else str(error)
+        log.warning("%s: entry %d is skipped: %s.", label, k + 1, reason)
+        return False
+    return True
+
+
+def _of_scene(entries: list[Mapping[str, Any]], image: Path, label: str) -> list[Mapping[str, Any]]:
+    """Of several scenes, the entries of the one that the picture's folder is named after. Raises PromptError."""
+    scenes = {int(e["scene_id"]) for e in entries if e.get("scene_id") is not None}
+    own = next((int(p.name) for p in image.resolve().parents if p.name.isascii() and p.name.isdigit()), None)
+    if len(scenes) < 2:
+        return entries
+    if own not in scenes:
+        where = "the picture lies in no folder of a scene's number" if own is None else f"the picture is of scene {own}"
+        raise PromptError(f"{label} is about the scenes {_some(scenes)}, and {where}: keep the entries of its scene.")
+    return [e for e in entries if e.get("scene_id") is None or int(e["scene_id"]) == own]
+
+
+def _of_picture(
+    entries: list[Mapping[str, Any]], image: Path, files: Mapping[int, str], label: str
+) -> list[Mapping[str, Any]]:
+    """The entries of a picture. Raises PromptError where several others have some and this one none."""
+    pictures = {int(e["image_id"]) for e in entries}
+    own = _image_number(image, files)
+    if own not in pictures and len(pictures) <= 1 and (own is None or own not in files):
+        return entries
+    found = [e for e in entries if int(e["image_id"]) == own]
+    if not found and own not in files:
+        which = "a picture without a number in its name" if own is None else f"image {own}"
+        raise PromptError(
+            f"{label} has nothing for {image.name} ({which}); it is about the images {_some(pictures)}. Name the "
+            "picture by its number, or keep its entries alone."
+        )
+    return found
+
+
+def _some(numbers: set[int]) -> str:
+    return ", ".join(map(str, sorted(numbers)[:8])) + (", ..." if len(numbers) > 8 else "")
 
 
 def _image_number(image: Path, files: Mapping[int, str]) -> int | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -26,17 +27,28 @@ def decode(segmentation: Any, size: tuple[int, int]) -> Mask:
     width, height = size
     try:
         if isinstance(segmentation, list):
+            if not all(isinstance(p, list) and len(p) >= 6 and len(p) % 2 == 0 for p in segmentation):
+                raise ValueError("a polygon has at least three points, x and y each")
             coded = rle.merge(rle.frPyObjects(segmentation, height, width))
         elif isinstance(segmentation["counts"], list):
             coded = rle.frPyObjects(segmentation, *segmentation["size"])
         else:
-            coded = {"size": segmentation["size"], "counts": segmentation["counts"].encode("ascii")}
-        mask = rle.decode(coded).astype(np.bool_)
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+            coded = {"size": segmentation["size"], "counts": _text(segmentation["counts"]).encode("ascii")}
+        if tuple(int(n) for n in coded["size"]) == (height, width):
+            mask = rle.decode(coded).astype(np.bool_)
+        else:
+            raise PromptError(f"a mask is {coded['size'][1]}x{coded['size'][0]}, its picture {width}x{height}.")
+    except PromptError:
+        raise
+    except Exception as error:  # pycocotools raises bare exceptions too
         raise PromptError(f"a segmentation is neither COCO's run lengths nor polygons ({error!r}).") from error
-    if mask.shape != (height, width):
-        raise PromptError(f"a mask is {mask.shape[1]}x{mask.shape[0]}, its picture {width}x{height}.")
     return np.asarray(mask)
+
+
+def _text(counts: str) -> str:
+    """Run lengths that were written as Python's b'...' without it."""
+    found = re.fullmatch(r"b(['\"])(.*)\1", counts, re.DOTALL)
+    return counts if found is None else found[2].replace("\\\\", "\\")
 
 
 def xywh(box: Box) -> list[float]:
