@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 import pytest
 
@@ -20,6 +22,7 @@ from posekit.render import Renderer
 from posekit.view import View
 
 CAMERA = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
+RENDERER = Renderer()
 PLACES = [(0.0, 0.0, 0.7), (0.33, -0.2, 0.8), (-0.4, 0.27, 0.9)]  # the middle and near two corners
 
 
@@ -43,7 +46,8 @@ class Oracle:
         source = np.stack([columns, rows], axis=1) * 4 + 2
         points = rendered.coords[source[:, 1], source[:, 0]] - self.model.center
         place = rendered.camera.project(target.apply(points))
-        found = Correspondences(source, place, np.ones(len(source)), np.ones(len(source)))
+        ones = np.ones(len(source))
+        found = Correspondences(source, place, ones, ones, ones)
         # the rendered pose, recovered from what was drawn: the oracle is told no pose
         drawn = rendered.camera.backproject(source, rendered.depth[source[:, 1], source[:, 0]])
         start = _align(points, drawn)
@@ -89,6 +93,39 @@ def test_an_oracle_brings_refine_to_the_truth_in_one_step(renderer, update, plac
     # the rendered depth is float32: the oracle's own knowledge of the start is good to about 1e-5
     assert turn < 0.02 and shift < 2e-4
     assert found.iterations == 1 and found.trace[0].T_cam_obj is start
+
+
+class Biased(Oracle):
+    """Sees where the object is, and is wrong about how it is turned: by ``turn`` (3,), a rotation vector."""
+
+    turn = np.deg2rad([3.0, -2.0, 1.0])
+
+    def _one(self, observed: View, rendered: View) -> PairPrediction:
+        right = super()._one(observed, rendered)
+        target = Pose.rotation(observed.R_view_cam) @ self.truth @ self.model.T_obj_ctr
+        mask = RENDERER.render(self.model, [target @ self.model.T_obj_ctr.inverse()], rendered.camera)[0].mask
+        assert mask is not None and right.correspondences is not None and rendered.coords is not None
+        share = cv2.resize(mask.astype(np.float32), (40, 30), interpolation=cv2.INTER_AREA)
+        found, wrong = right.correspondences, Pose(so3_exp(self.turn) @ target.R, target.t)
+        points = rendered.coords[found.source[:, 1], found.source[:, 0]] - self.model.center
+        moved = dataclasses.replace(found, target=rendered.camera.project(wrong.apply(points)))
+        return PairPrediction(right.delta, 0.01, moved, np.stack([share, share]))
+
+
+def test_the_outline_mends_what_correspondences_get_wrong(renderer) -> None:
+    model = bracket()
+    truth = Pose(view_rotation([0.5, -1.0, 0.6]), PLACES[0]) @ model.T_obj_ctr.inverse()
+    rng = np.random.default_rng(0)
+    view = photograph(renderer, model, truth)
+    noise = rng.integers(150, 200, view.image.shape).astype(np.uint8)
+    view = View(np.where(view.mask[..., None], view.image, noise), CAMERA)
+    turns = []
+    for outline in (False, True):
+        options = RefineOptions(stop="fixed", iterations=4, outline=outline)
+        turns.append(
+            errors(refine(view, model, [truth], Biased(model, truth), renderer, options)[0].T_cam_obj, truth)[0]
+        )
+    assert turns[0] > 3 and turns[1] < 0.5 * turns[0]
 
 
 def test_the_predicted_angle_stops_the_loop(renderer) -> None:

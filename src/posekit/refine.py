@@ -11,15 +11,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from posekit.errors import ConfigError
+from posekit.fusion import Points, fuse
 from posekit.geometry import Pose, rotation_angle
 from posekit.nets.pose_delta import apply_delta
-from posekit.nets.predictor import PairPrediction, Predictor
+from posekit.nets.predictor import Correspondences, PairPrediction, Predictor
 from posekit.object_model import ObjectModel
 from posekit.pnp import solve_pnp
+from posekit.region import learn, outline_lines
 from posekit.render import Renderer
 from posekit.results import Step
 from posekit.view import View
@@ -27,6 +30,9 @@ from posekit.zoom import zoom_to_pose
 
 UPDATES = ("regression", "correspondence")
 STOPS = ("angle", "fixed")
+NEAR = float(np.deg2rad(12.0))  # corrections below which the outline is looked for: further off it is out of reach
+LEAST_SCALE, KNEE = 0.5, 2.5  # pixels, no correspondence is more exact; standard deviations
+TOGETHER = 25.0  # so many correspondences err alike: they count as one against the outline's lines
 
 
 @dataclass(frozen=True)
@@ -34,7 +40,9 @@ class RefineOptions:
     """update: what moves the pose, the regressed delta or the correspondences through PnP.
     stop: ``angle`` (the paper's policy) or ``fixed`` (DeepIM's). iterations: at most, or exactly.
     stop_angle: radians. last_update: also apply the update predicted for the pose that ended the loop. patience: with
-    ``angle``, how many iterations may pass without a new lowest predicted angle."""
+    ``angle``, how many iterations may pass without a new lowest predicted angle. outline: whether the place of the
+    outline that the photograph's colours show is weighed against the correspondences, once these ask for small turns
+    only (see `with_outline`)."""
 
     update: str = "correspondence"
     stop: str = "angle"
@@ -42,6 +50,7 @@ class RefineOptions:
     stop_angle: float = float(np.deg2rad(2.0))
     last_update: bool = True
     patience: int = 8
+    outline: bool = True
 
     def __post_init__(self) -> None:
         if self.update not in UPDATES or self.stop not in STOPS:
@@ -95,7 +104,7 @@ def refine(
         poses = [loop.pose for loop in active]
         predictions, observed, rendered = compare(view, model, outline, poses, predictor, renderer)
         for loop, prediction, seen, drawn in zip(active, predictions, observed, rendered, strict=True):
-            updated = update_pose(loop.pose, model, prediction, seen, drawn, options.update)
+            updated = update_pose(loop.pose, model, prediction, seen, drawn, options.update, options.outline)
             loop.advance(predicted_angle(loop.pose, prediction, updated, options.update), updated, options)
     return [loop.finish(options) for loop in loops]
 
@@ -130,9 +139,18 @@ def crops(
 
 
 def update_pose(
-    T_cam_obj: Pose, model: ObjectModel, prediction: PairPrediction, observed: View, rendered: View, update: str
+    T_cam_obj: Pose,
+    model: ObjectModel,
+    prediction: PairPrediction,
+    observed: View,
+    rendered: View,
+    update: str,
+    outline: bool = False,
 ) -> Pose | None:
-    """The pose after one prediction; None where it gives none (too few correspondences, behind the camera)."""
+    """The pose after one prediction; None where it gives none (too few correspondences, behind the camera).
+
+    outline: whether small corrections by correspondences are weighed against the outline, see `with_outline`.
+    """
     T_view_cam = Pose.rotation(observed.R_view_cam)
     source = T_view_cam @ T_cam_obj @ model.T_obj_ctr
     if update == "regression":
@@ -142,9 +160,44 @@ def update_pose(
         assert found is not None and rendered.coords is not None
         points = rendered.coords[found.source[:, 1], found.source[:, 0]] - model.center
         target = solve_pnp(points, found.target, found.weight, found.scale_px, rendered.camera, source)
+        if outline and target is not None and prediction.silhouettes is not None:
+            turn = max(prediction.angle, float(rotation_angle(target.R @ source.R.T)))
+            if turn < NEAR:
+                target = with_outline(target, points, found, prediction, observed, rendered, model.center)
     if target is None or not np.isfinite(target.matrix).all() or target.t[2] < 0.6 * model.diameter:
         return None
     return T_view_cam.inverse() @ target @ model.T_obj_ctr.inverse()
+
+
+def with_outline(
+    target: Pose,
+    points: NDArray[np.float64],
+    found: Correspondences,
+    prediction: PairPrediction,
+    observed: View,
+    rendered: View,
+    center: NDArray[np.float64],
+) -> Pose:
+    """The ``T_view_ctr`` on which correspondences and the photograph's outline agree best; ``target`` where the colours
+    do not show one.
+
+    target: by the correspondences alone. points: (N, 3) metres in ``ctr``, of ``found``. The colours of the object and
+    of what is round it are learned from the silhouette that the network sees in the crop, not from the pose's; where it
+    sees something in front, the outline is not asked. center: (3,), the model's.
+    """
+    assert prediction.silhouettes is not None
+    visible, whole = (cv2.resize(s, rendered.camera.size, interpolation=cv2.INTER_LINEAR) > 0.5
+                      for s in prediction.silhouettes)  # fmt: skip
+    if not visible.any():
+        return target
+    colours = learn(observed, visible, np.ones_like(visible))
+    lines = outline_lines(observed, rendered, colours, ~(whole & ~visible), center)
+    if lines is None:
+        return target
+    scale = np.maximum(found.scale_px, LEAST_SCALE)
+    matched = Points(points, found.target, found.weight, scale, KNEE, TOGETHER)
+    both = fuse(target, [matched, lines], rendered.camera)
+    return target if both is None else both.pose
 
 
 def predicted_angle(T_cam_obj: Pose, prediction: PairPrediction, updated: Pose | None, update: str) -> float:

@@ -65,7 +65,7 @@ def passed_poses(
             for n in range(iterations):
                 [found], [seen], [drawn] = compare(case.view, case.model, outline, [pose], predictor, renderer)
                 angles.append(_error(pose, case))
-                updated = update_pose(pose, case.model, found, seen, drawn, update)
+                updated = update_pose(pose, case.model, found, seen, drawn, update, outline=True)
                 last.append(updated is None or n == iterations - 1)
                 if updated is None:
                     break

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from posekit.data.appearance import variants
 from posekit.data.augment import AugmentConfig, observe
 from posekit.data.bop import BopDataset
 from posekit.data.procedural import random_object
@@ -40,12 +41,15 @@ class Case:
 
 @dataclass(frozen=True, eq=False)
 class CaseSource:
-    """What renderings for cases are made of. models: in turn; none = new procedural objects."""
+    """What renderings for cases are made of. models: in turn; none = new procedural objects. unlike, deformed: the
+    shares of cases whose mesh looks other than the object that is shown, or strays from it (`appearance.variants`)."""
 
     models: Sequence[ObjectModel]
     photos: Sequence[NDArray[np.uint8]]
     scenes: SceneConfig
     augment: AugmentConfig
+    unlike: float = 0.0
+    deformed: float = 0.0
 
 
 def rendered_cases(source: CaseSource, renderer: Renderer, count: int, seed: int = HELD_BACK) -> list[Case]:
@@ -56,13 +60,14 @@ def rendered_cases(source: CaseSource, renderer: Renderer, count: int, seed: int
     others: list[NDArray[np.uint8]] = []
     while len(cases) < count:
         model = models[len(cases) % len(models)] if models else random_object(rng, photos)
-        for scene in render_scenes(renderer, model, 1, config, rng):
+        known, shown = variants(model, photos, source.unlike, source.deformed, rng)
+        for scene in render_scenes(renderer, shown, 1, config, rng):
             picture, _ = observe(scene.rgba, others, photos, replace(augment, no_mask=0.0), rng)
             others.append(scene.rgba)
             view = view_of(picture, scene.camera)
-            truth = scene.T_view_ctr @ model.T_obj_ctr.inverse()
+            truth = scene.T_view_ctr @ shown.T_obj_ctr.inverse()
             detection = Detection(disturbed_box(scene.box, config, rng), mask=view.mask, source="rendered")
-            cases.append(_case(view, model, truth, detection, rng))
+            cases.append(_case(view, known, truth, detection, rng))
     return cases
 
 

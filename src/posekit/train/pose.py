@@ -83,7 +83,9 @@ def _calibrate(
     """With renderings as the stream has them: of given meshes, of procedural ones, or both by the stream's share."""
     networks, renderer, stream = load_networks(preset, weights), Renderer(), config.stream
     models = sources.models or [m for data, _ in sources.bop for m in map(data.model, data.model_ids())]
-    source = CaseSource(models, sources.photos, stream.scenes, stream.augment)
+    source = CaseSource(
+        models, sources.photos, stream.scenes, stream.augment, stream.pairs.unlike, stream.pairs.deformed
+    )
     given = round(config.calibrate * (stream.share if models else 0.0))
     cases = rendered_cases(source, renderer, given, SEED) if given else []
     cases += rendered_cases(dataclasses.replace(source, models=[]), renderer, config.calibrate - given, SEED)
