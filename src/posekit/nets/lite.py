@@ -331,8 +331,9 @@ def normals_of(relief: Tensor, mask: Tensor) -> Tensor:
     height = relief * relief.shape[2]
     slopes = []
     for dim in (2, 1):
-        ahead = torch.diff(height, dim=dim)
-        both = torch.diff(mask, dim=dim).abs() < 0.5  # on the object, or both beside it
+        count = height.shape[dim] - 1
+        ahead = height.narrow(dim, 1, count) - height.narrow(dim, 0, count)
+        both = (mask.narrow(dim, 1, count) - mask.narrow(dim, 0, count)).abs() < 0.5  # on the object, or beside it
         ahead = torch.where(both, ahead, torch.full_like(ahead, 1e3))
         edge = torch.full_like(ahead.narrow(dim, 0, 1), 1e3)
         forward, backward = torch.cat([ahead, edge], dim), torch.cat([edge, ahead], dim)
