@@ -18,7 +18,7 @@ from posekit.metrics import pose_error
 from posekit.nets.weights import build, save_networks
 from posekit.refine import pose_change
 from posekit.render import Renderer
-from posekit.results import Detection
+from posekit.results import Detection, Source
 from posekit.view import View
 
 
@@ -30,7 +30,7 @@ def examples():  # type: ignore[no-untyped-def]
 
 def masked(renderer: Renderer, example) -> Detection:  # type: ignore[no-untyped-def]
     [seen] = renderer.render(example.model, [example.T_cam_obj], example.view.camera, rgb=False, coords=False)
-    return Detection(example.box, seen.mask, 1.0, example.model.name, "mask")
+    return Detection(example.box, seen.mask, 1.0, example.model.name, Source.MASK)
 
 
 def test_refinement_brings_disturbed_poses_nearer(examples) -> None:

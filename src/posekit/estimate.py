@@ -23,7 +23,7 @@ from posekit.hypotheses import (
     poses_beside,
 )
 from posekit.nets.predictor import NetworkPredictor
-from posekit.nets.weights import load_networks
+from posekit.nets.weights import Networks, load_networks
 from posekit.object_model import ObjectModel
 from posekit.refine import Refinement, RefineOptions, compare, refine
 from posekit.region import fit_outline
@@ -45,8 +45,7 @@ class EstimateOptions:
     beside: whether poses beside a known
     one are tried too where it does not converge at once. contour: whether the pose is laid onto the mask's outline
     where the mask proves exact. outline: whether it is laid onto the one that the photograph's colours show where there
-    is no such mask. seed: for whatever is drawn at random. The rest is
-    RefineOptions', with the angle in degrees."""
+    is no such mask. The rest is RefineOptions', with the angle in degrees."""
 
     init: str = "templates"
     hypotheses: int = 5
@@ -54,7 +53,6 @@ class EstimateOptions:
     stop: str = "angle"
     iterations: int = 50
     stop_angle_deg: float = 2.0
-    seed: int = 0
     beside: bool = True
     contour: bool = True
     outline: bool = True
@@ -74,6 +72,7 @@ class EstimateOptions:
 class PoseEstimator:
     """Estimates the pose of one object in photographs.
 
+    networks: where several estimators share them, in place of those that preset and weights name; see `Estimators`.
     Not thread-safe: one estimator per thread. Raises WeightsError where the preset has no weights.
     """
 
@@ -84,15 +83,10 @@ class PoseEstimator:
         preset: str = "lite",
         weights: Path | None = None,
         options: EstimateOptions = EstimateOptions(),
-        threads: int | None = None,
+        networks: Networks | None = None,
     ) -> None:
-        import torch
-
-        if threads is not None:
-            torch.set_num_threads(threads)
-        torch.manual_seed(options.seed)
         self.model, self.options = model, options
-        self.networks = load_networks(preset, weights)
+        self.networks = load_networks(preset, weights) if networks is None else networks
         self.predictor = NetworkPredictor(self.networks)
         self.renderer = Renderer()
         self._search: BoxSearch | MVNetSearch | None = None
@@ -242,6 +236,24 @@ class PoseEstimator:
         points = T_cam_obj.apply(self.model.outline)
         points[:, 2] = np.maximum(points[:, 2], 1e-3)
         return view.camera.points_box(points)
+
+
+class Estimators:
+    """One estimator for each mesh, all with the same networks; an estimator is made when it is first asked for.
+
+    Raises WeightsError where the preset has no weights.
+    """
+
+    def __init__(
+        self, *, preset: str = "lite", weights: Path | None = None, options: EstimateOptions = EstimateOptions()
+    ) -> None:
+        self.networks, self.options = load_networks(preset, weights), options
+        self._made: dict[ObjectModel, PoseEstimator] = {}
+
+    def __call__(self, model: ObjectModel) -> PoseEstimator:
+        if model not in self._made:
+            self._made[model] = PoseEstimator(model, options=self.options, networks=self.networks)
+        return self._made[model]
 
 
 def score(angle: float, evidence: float) -> float:

@@ -30,6 +30,7 @@ from posekit.odometry import Look, follow_points, match_texture
 from posekit.refine import crops
 from posekit.region import Colours, Tint, learn, like_mesh, off_colour, outline_lines
 from posekit.results import Detection, Estimate
+from posekit.search import SearchOptions, find_instances
 from posekit.view import View
 
 TRACKED, RESTARTED, LOST = "tracked", "restarted", "lost"
@@ -63,7 +64,7 @@ class TrackConfig:
     keep: share of what was known that holds for the next frame. alike: share of the silhouette with the object's
     colours, below which a frame is in doubt. learn: share of a frame in these colours. least_inside: share of the
     silhouette's box in the picture, likewise. doubts: frames in doubt in a row after which the object is lost. search:
-    frames between two attempts to find it. first: least score of a first pose. runtime: of the network."""
+    frames between two attempts to find it. runtime: of the network."""
 
     restart_deg: float = 25.0
     still_deg: float = 0.0
@@ -80,7 +81,6 @@ class TrackConfig:
     least_inside: float = 0.3
     doubts: int = 3
     search: int = 5
-    first: float = 0.35
     runtime: str = "openvino"
 
     def __post_init__(self) -> None:
@@ -91,8 +91,8 @@ class TrackConfig:
             )
         if min(self.iterations, self.doubts, self.search) < 1:
             raise ConfigError("iterations, doubts and search are at least 1.")
-        if not all(0 <= share <= 1 for share in (self.prior, self.alike, self.learn, self.least_inside, self.first)):
-            raise ConfigError("prior, alike, learn, least_inside and first are shares between 0 and 1.")
+        if not all(0 <= share <= 1 for share in (self.prior, self.alike, self.learn, self.least_inside)):
+            raise ConfigError("prior, alike, learn and least_inside are shares between 0 and 1.")
         if not 0 < self.keep <= 1:
             raise ConfigError(f"keep is a share above 0, at most 1, not {self.keep:g}.")
         for name, known in (("mask", MASKS), ("motion", MOTIONS), ("runtime", RUNTIMES)):
@@ -359,12 +359,13 @@ class Tracker:
         if self.detector is None or self._waiting > 0:
             return Tracked(LOST)
         self._waiting = self.config.search
-        detections = [d for d in self.detector.detect(view, [self.model]) if d.label in (None, self.model.name)]
-        found = max(self.estimator.estimate(view, detections, self.config.first), key=lambda e: e.score, default=None)
-        if found is None or found.score < self.config.first or not self._begin(view, found.T_cam_obj, found.angle):
+        detections = self.detector.detect(view, [self.model])
+        # nobody vouches for every frame's detections: poses must be borne out, whoever detects
+        [found] = find_instances(lambda _: self.estimator, view, [self.model], detections, SearchOptions())
+        if not found.instances or not self._begin(view, found.instances[0].T_cam_obj, found.instances[0].angle):
             return Tracked(LOST)
         self._waiting = 0
-        return Tracked(RESTARTED, found)
+        return Tracked(RESTARTED, found.instances[0])
 
 
 def _about(pose: Pose, camera: Camera, spread: tuple[float, float, float]) -> Belief:

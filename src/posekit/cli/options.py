@@ -105,10 +105,18 @@ OutlineOption = Annotated[
         rich_help_panel=LOOP,
     ),
 ]
-SeedOption = Annotated[int, typer.Option(help="The same seed gives the same result.", rich_help_panel=LOOP)]
 ThreadsOption = Annotated[
     int | None, typer.Option(min=1, help="Threads of torch; by default its own choice.", rich_help_panel=LOOP)
 ]
+
+
+def use_threads(count: int | None) -> None:
+    """Let torch use so many threads from now on in this process; its own choice where none is given."""
+    if count is not None:
+        import torch
+
+        torch.set_num_threads(count)
+
 
 OutOption = Annotated[
     Path | None,

@@ -9,7 +9,7 @@ from posekit.camera import mask_box
 from posekit.estimate import PoseEstimator
 from posekit.evaluate.truths import Truth
 from posekit.object_model import ObjectModel
-from posekit.results import Detection
+from posekit.results import Detection, Source
 from posekit.track import TrackConfig, Tracked, Tracker
 from posekit.view import View
 
@@ -25,7 +25,7 @@ class TrueMask:
         mask = self.truth.read_mask()
         box = mask_box(mask)
         known = box is not None and mask.shape == view.image.shape[:2]
-        return [Detection(box, mask, 1.0, models[0].name, "mask")] if box is not None and known else []
+        return [Detection(box, mask, 1.0, models[0].name, Source.MASK)] if box is not None and known else []
 
 
 class Sequences:
