@@ -43,7 +43,7 @@ class Oracle:
         source = np.stack([columns, rows], axis=1) * 4 + 2
         points = rendered.coords[source[:, 1], source[:, 0]] - self.model.center
         place = rendered.camera.project(target.apply(points))
-        found = Correspondences(source, place, np.ones(len(source)), np.ones(len(source)))
+        found = Correspondences(source, place, *(np.ones(len(source)) for _ in range(3)))
         # the rendered pose, recovered from what was drawn: the oracle is told no pose
         drawn = rendered.camera.backproject(source, rendered.depth[source[:, 1], source[:, 0]])
         start = _align(points, drawn)

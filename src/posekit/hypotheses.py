@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from posekit.camera import Box, Camera, Zoom
+from posekit.camera import Box, Camera
 from posekit.errors import PromptError, WeightsError
 from posekit.evidence import Palette, Picture, Silhouettes, Weights
 from posekit.geometry import (
@@ -277,7 +277,8 @@ class BoxSearch:
         """
         zoom = box_window(view.camera, detection.box, FINER * self.options.side, self.options.root / self.options.side)
         masked = view.with_mask(detection.mask)
-        crop, shown = masked.zoomed(zoom), shown_in(view, zoom)
+        crop = masked.zoomed(zoom)
+        shown = crop.shown
         if not shown.any() or (detection.mask is not None and (crop.mask is None or not crop.mask.any())):
             return []
         palette = Palette(crop.image, shown)
@@ -370,7 +371,8 @@ class Judge:
         """view: the photograph; its mask, where there is one, counts too. box: edges, round what the poses show."""
         self.model, self.renderer, self.weights = model, renderer, weights_for(model, weights)
         self.zoom = box_window(view.camera, box, JUDGED, BoxOptions.root / BoxOptions.side)
-        crop, shown = view.zoomed(self.zoom), shown_in(view, self.zoom)
+        crop = view.zoomed(self.zoom)
+        shown = crop.shown
         self.picture = Picture.of(crop.image, shown, Palette(crop.image, shown), crop.mask) if shown.any() else None
 
     def scores(self, poses: Sequence[Pose]) -> list[float]:
@@ -481,12 +483,6 @@ def weights_for(model: ObjectModel, weights: Weights) -> Weights:
     """Without the colour agreement for a mesh without colours: its shading depends on a light that nobody knows."""
     plain = model.colors is None and model.texture is None
     return replace(weights, agreement=0.0) if plain else weights
-
-
-def shown_in(view: View, zoom: Zoom) -> NDArray[np.bool_]:
-    """Where (H, W) a zoomed picture shows the photograph."""
-    ones = np.ones((view.camera.height, view.camera.width), np.uint8)
-    return np.asarray(cv2.warpPerspective(ones, zoom.homography, zoom.camera.size, flags=cv2.INTER_NEAREST) > 0)
 
 
 def box_mask(box: tuple[float, float, float, float], camera: Camera) -> NDArray[np.bool_]:

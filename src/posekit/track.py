@@ -157,12 +157,16 @@ class Tracker:
         self._doubts = 0
         self._waiting = 0  # frames until the next search
 
-    def step(self, image: NDArray[np.uint8], camera: Camera | None = None) -> Tracked:
-        """The object in the next frame. image: uint8 RGB (H, W, 3). Raises CameraError where no camera is known."""
+    def step(
+        self, image: NDArray[np.uint8], camera: Camera | None = None, valid: NDArray[np.bool_] | None = None
+    ) -> Tracked:
+        """The object in the next frame. image: uint8 RGB (H, W, 3). valid: as a `View` has it.
+
+        Raises CameraError where no camera is known."""
         chosen = camera or self.camera
         if chosen is None:
             raise CameraError("the tracker was made without a camera: pass one with each frame.")
-        view = View(image, chosen)
+        view = View(image, chosen, valid=valid)
         if self._given is not None:
             started, pose, self._given = time.perf_counter(), self._given, None
             if self._begin(view, pose, math.radians(GIVEN[0])):

@@ -209,7 +209,7 @@ def _step(trackers: Sequence[Tracker], frame: Frame, counts: _Counts) -> list[Tr
         results = [Tracked(LOST) for _ in trackers]
     else:
         counts.used += 1
-        results = [tracker.step(frame.image, frame.camera) for tracker in trackers]
+        results = [tracker.step(frame.image, frame.camera, frame.valid) for tracker in trackers]
     for result in results:
         counts.states[result.state] = counts.states.get(result.state, 0) + 1
     return results

@@ -55,5 +55,5 @@ class Sequences:
     def _one(self, obj_id: int, view: View, truths: Sequence[Truth]) -> tuple[Tracked, int, int | None]:
         tracker, mask = self.trackers[obj_id]
         mask.truth = next((t for t in truths if t.instance.obj_id == obj_id), None)
-        found = tracker.step(view.image, view.camera)
+        found = tracker.step(view.image, view.camera, view.valid)
         return found, obj_id, None if mask.truth is None else mask.truth.instance.index
