@@ -23,7 +23,6 @@ from posekit.geometry import (
     cube_views,
     fibonacci_sphere,
     quat_to_rotation,
-    rotation_angle,
     rotation_between,
     so3_exp,
     view_rotation,
@@ -148,7 +147,7 @@ class TemplateSearch:
             row, column = np.unravel_index(flat, scores.shape)
             turn, patch = usable[int(row)]
             pose = self._pose(crop, turn, patch, int(column))
-            if all(rotation_angle(pose.R.T @ h.T_cam_obj.R) > self.options.apart for h in found):
+            if _is_apart(pose, found, self.model, self.options.apart):
                 found.append(Hypothesis(pose, float(scores[row, column])))
             if len(found) == count:
                 break
@@ -298,7 +297,7 @@ class BoxSearch:
         found: list[Hypothesis] = []
         for k in np.argsort(-scores, kind="stable"):
             pose = self._pose(crop, self.placed[rows[k]], moves[k])
-            if all(rotation_angle(pose.R.T @ h.T_cam_obj.R) > self.options.apart for h in found):
+            if _is_apart(pose, found, self.model, self.options.apart):
                 found.append(Hypothesis(pose, float(scores[k])))
             if len(found) == count:
                 break
@@ -423,6 +422,13 @@ class MVNetSearch:
     def frontal(self, crop_camera: Camera) -> Pose:
         """The ``T_view_ctr`` to which MV-Net's answer is relative."""
         return frontal_pose(self.camera, self.distance, crop_camera)
+
+
+def _is_apart(pose: Pose, found: Sequence[Hypothesis], model: ObjectModel, angle: float) -> bool:
+    """Whether a ``T_cam_obj`` is further than ``angle`` from all that were found, and from all that look the same."""
+    if not found:
+        return True
+    return bool((model.symmetries.angles(pose.R, np.stack([h.T_cam_obj.R for h in found])) > angle).all())
 
 
 def poses_beside(T_cam_obj: Pose, model: ObjectModel, angle: float) -> list[Pose]:

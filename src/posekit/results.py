@@ -66,14 +66,24 @@ class Step:
     angle: float
 
 
+class Branch(StrEnum):
+    """Which of the poses in which a symmetric object looks the same was taken."""
+
+    ANY = "any"  # there was nothing to choose by
+    GIVEN = "given"  # the one nearest to the pose that was given
+    LAST = "last"  # the one nearest to the last frame's
+
+
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """An object's pose in a photograph.
 
-    angle: predicted rotation error, radians. iterations: used for this result. converged: whether the angle fell
-    below the threshold. score: in [0, 1], how likely the object is there in this pose. box: of the object at this pose,
-    edges, pixels. model: the mesh's name. detection: what it started from. trace: the poses on the way, first to last.
-    timings: seconds by stage.
+    angle: the rotation error, radians, that the network predicts for T_cam_obj itself; for a tracked frame, for the
+    pose at which the frame was compared. contour_std: where the pose was laid onto an exact mask's outline, the
+    standard deviation of its rotation, radians. iterations: used for this result. converged: whether contour_std, or
+    else the angle, is below the threshold. branch: None for an object without symmetries. score: in [0, 1], how likely
+    the object is there in this pose. box: of the object at this pose, edges, pixels. model: the mesh's name.
+    detection: what it started from. trace: the poses on the way, first to last. timings: seconds by stage.
     """
 
     T_cam_obj: Pose
@@ -86,6 +96,8 @@ class Estimate:
     detection: Detection | None = None
     trace: tuple[Step, ...] = ()
     timings: Mapping[str, float] = field(default_factory=dict)
+    contour_std: float | None = None
+    branch: Branch | None = None
 
 
 def estimates_to_json(
@@ -138,7 +150,9 @@ def _estimate_to_dict(estimate: Estimate) -> dict[str, Any]:
         "t_m": estimate.T_cam_obj.t.tolist(),
         "angle_deg": math.degrees(estimate.angle),
         "iterations": estimate.iterations,
+        "contour_std_deg": None if estimate.contour_std is None else math.degrees(estimate.contour_std),
         "converged": estimate.converged,
+        "branch": None if estimate.branch is None else estimate.branch.value,
         "score": estimate.score,
         "box": list(estimate.box),
         "detection": found
@@ -165,6 +179,8 @@ def _estimate_from_dict(entry: Mapping[str, Any]) -> Estimate:
         and Detection(_box(found["box"]), None, _number(found["score"]), found["label"], Source(found["source"])),
         trace=tuple(Step(Pose.from_matrix(s["T_cam_obj"]), _radians(s["angle_deg"])) for s in entry["trace"]),
         timings={stage: _number(seconds) for stage, seconds in entry["timings_s"].items()},
+        contour_std=None if entry.get("contour_std_deg") is None else _radians(entry["contour_std_deg"]),
+        branch=None if entry.get("branch") is None else Branch(entry["branch"]),
     )
 
 

@@ -11,7 +11,7 @@ import math
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from posekit.camera import Camera
 from posekit.errors import CameraError, ConfigError
-from posekit.estimate import PoseEstimator
+from posekit.estimate import PoseEstimator, nearest_to
 from posekit.fusion import Belief, Points, Term, fuse
 from posekit.geometry import Pose, rotation_angle, so3_exp, so3_log
 from posekit.nets.pose_delta import apply_delta
@@ -29,7 +29,7 @@ from posekit.object_model import ObjectModel
 from posekit.odometry import Look, follow_points, match_texture
 from posekit.refine import crops
 from posekit.region import Colours, Tint, learn, like_mesh, off_colour, outline_lines
-from posekit.results import Detection, Estimate
+from posekit.results import Branch, Detection, Estimate
 from posekit.search import SearchOptions, find_instances
 from posekit.view import View
 
@@ -56,7 +56,8 @@ class Finder(Protocol):
 @dataclass(frozen=True)
 class TrackConfig:
     """restart_deg, still_deg: predicted angles above which a frame is in doubt, and below which the network leaves the
-    pose to points and outline, both degrees. iterations: comparisons of a frame at most; a second one follows a turn of
+    pose to points and outline, both degrees. converged_deg: the predicted angle below which an estimate says
+    that it converged. iterations: comparisons of a frame at most; a second one follows a turn of
     more than ``again_deg``. motion: where a frame's comparison starts: where followed points lead ("points"), the share
     ``prior`` of the last motion once more ("velocity"), or the last pose ("none"). outline, texture: whether the
     colours' place of the outline counts, and the mesh's texture where the frame shows it. mask: what a frame's mask is
@@ -68,6 +69,7 @@ class TrackConfig:
 
     restart_deg: float = 25.0
     still_deg: float = 0.0
+    converged_deg: float = 2.0
     again_deg: float = 8.0
     iterations: int = 1
     motion: str = "points"
@@ -149,6 +151,7 @@ class Tracker:
         self._outline = model.outline - model.center
         self._beside = ThreadPoolExecutor(1, "posekit-network")
         self._given = pose  # a first pose that no frame has been seen with
+        self._told = pose  # the last ``T_cam_obj`` that was told, whether or not the object was lost since
         self._belief: Belief | None = None  # ``T_cam_ctr``
         self._motion = Pose.identity()  # of the object's centre and axes, from the frame before the last to the last
         self._before: Look | None = None
@@ -170,12 +173,15 @@ class Tracker:
         if self._given is not None:
             started, pose, self._given = time.perf_counter(), self._given, None
             if self._begin(view, pose, math.radians(GIVEN[0])):
-                timings = {"network": 0.0, "total": time.perf_counter() - started}
-                return Tracked(TRACKED, self._estimate(view, pose, math.radians(GIVEN[0]), 0, 1.0, timings))
+                assert self._before is not None
+                prediction, network = self._asked(self._before.seen, self._before.drawn, self._before.visible)
+                timings = {"network": network, "total": time.perf_counter() - started}
+                found = self._estimate(view, pose, prediction.angle, 0, 1.0, timings)
+                return Tracked(TRACKED, self._on_branch(found, Branch.GIVEN))
         if self._belief is not None:
             found = self._follow(view, self._belief)
             if found is not None and not self._lost_sight(view, found):
-                return Tracked(TRACKED, found)
+                return Tracked(TRACKED, self._on_branch(found))
             self._lose()
         return self._find(view)
 
@@ -332,10 +338,20 @@ class Tracker:
         self, view: View, pose: Pose, angle: float, iterations: int, score: float, timings: dict[str, float]
     ) -> Estimate:
         box = view.camera.points_box(_before_camera(pose.apply(self.model.outline)))
-        return Estimate(pose, angle, iterations, True, score, box, self.model.name, timings=timings)
+        converged = angle < math.radians(self.config.converged_deg)
+        return Estimate(pose, angle, iterations, converged, score, box, self.model.name, timings=timings)
 
     def _in_front(self, pose: Pose) -> bool:
         return bool(np.isfinite(pose.matrix).all() and pose.apply(self.model.center)[2] > NEAR * self.model.diameter)
+
+    def _on_branch(self, found: Estimate, branch: Branch = Branch.LAST) -> Estimate:
+        """Of equivalent poses the one nearest to the last one that was told, where there is one."""
+        if self._told is not None:
+            found = nearest_to(self._told, found, self.model, branch)
+        elif self.model.symmetries:
+            found = replace(found, branch=Branch.ANY)
+        self._told = found.T_cam_obj
+        return found
 
     # --- losing and finding ---
 
@@ -369,7 +385,7 @@ class Tracker:
         if not found.instances or not self._begin(view, found.instances[0].T_cam_obj, found.instances[0].angle):
             return Tracked(LOST)
         self._waiting = 0
-        return Tracked(RESTARTED, found.instances[0])
+        return Tracked(RESTARTED, self._on_branch(found.instances[0]))
 
 
 def _about(pose: Pose, camera: Camera, spread: tuple[float, float, float]) -> Belief:

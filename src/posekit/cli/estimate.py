@@ -72,7 +72,7 @@ def estimate(
     weights: WeightsOption = None,
     init: InitOption = "templates",
     hypotheses: HypothesesOption = 5,
-    update: UpdateOption = "correspondence",
+    update: UpdateOption = "auto",
     stop: StopOption = "angle",
     iterations: IterationsOption = 50,
     stop_angle: StopAngleOption = 2.0,

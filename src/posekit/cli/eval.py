@@ -83,7 +83,7 @@ def evaluate(
     weights: WeightsOption = None,
     init: InitOption = "templates",
     hypotheses: HypothesesOption = 5,
-    update: UpdateOption = "correspondence",
+    update: UpdateOption = "auto",
     stop: StopOption = "angle",
     iterations: IterationsOption = 50,
     stop_angle: StopAngleOption = 2.0,

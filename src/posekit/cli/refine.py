@@ -51,7 +51,7 @@ def refine(
     symmetry: SymmetryOption = None,
     preset: PresetOption = "lite",
     weights: WeightsOption = None,
-    update: UpdateOption = "correspondence",
+    update: UpdateOption = "auto",
     stop: StopOption = "angle",
     iterations: IterationsOption = 50,
     stop_angle: StopAngleOption = 2.0,

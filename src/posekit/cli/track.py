@@ -101,7 +101,7 @@ def track(
     folder = OutputFolder(out or Path("posekit-out") / f"{Path(source).stem or 'camera'}-track", force)
 
     from posekit.errors import ImageError, PromptError
-    from posekit.estimate import EstimateOptions, Estimators
+    from posekit.estimate import Estimators
     from posekit.load import load_pose
     from posekit.object_model import ObjectModel
     from posekit.track import TrackConfig, Tracker
@@ -128,8 +128,7 @@ def track(
         from posekit.novel import make_detector
 
         finder, _ = make_detector(detector, meshes, doubtful=True)
-    chosen = EstimateOptions(update="correspondence" if preset == "lite" else "regression")
-    estimators = Estimators(preset=preset, weights=weights, options=chosen)
+    estimators = Estimators(preset=preset, weights=weights)
     trackers = [
         Tracker(mesh, pose=start, detector=finder, config=config, estimator=estimators(mesh))
         for mesh, start in zip(meshes, starts, strict=True)
