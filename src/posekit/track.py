@@ -176,8 +176,8 @@ class Tracker:
                 assert self._before is not None
                 prediction, network = self._asked(self._before.seen, self._before.drawn, self._before.visible)
                 timings = {"network": network, "total": time.perf_counter() - started}
-                found = self._estimate(view, pose, prediction.angle, 0, 1.0, timings)
-                return Tracked(TRACKED, self._on_branch(found, Branch.GIVEN))
+                given = self._estimate(view, pose, prediction.angle, 0, 1.0, timings)
+                return Tracked(TRACKED, self._on_branch(given, Branch.GIVEN))
         if self._belief is not None:
             found = self._follow(view, self._belief)
             if found is not None and not self._lost_sight(view, found):
