@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from posekit.data.bop import BopDataset
-from posekit.estimate import PoseEstimator
+from posekit.estimate import Estimators
 from posekit.novel import make_detector
 from posekit.object_model import ObjectModel
-from posekit.search import SearchOptions, estimate_instances
+from posekit.search import SearchOptions, find_instances
 
 
 def main() -> None:
@@ -34,18 +34,18 @@ def main() -> None:
     data = BopDataset(args.root, split=args.split) if args.split else BopDataset(args.root)
     models = [ObjectModel.load(path, units=args.units) for path in args.meshes]
     detector, _ = make_detector(args.detector, models)
-    estimators = [PoseEstimator(model) for model in models]
+    estimators = Estimators()
     pictures = data.images()
     chosen = np.linspace(0, len(pictures) - 1, min(args.images, len(pictures))).astype(int)
     scores, seconds = [], []
     for n, k in enumerate(chosen):
-        view, model, estimator = data.view(*pictures[k]), models[n % len(models)], estimators[n % len(models)]
+        view, model = data.view(*pictures[k]), models[n % len(models)]
         started = time.perf_counter()
         found = detector.detect(view, [model])
         detected = time.perf_counter()
-        best = estimate_instances(estimator, view, found, SearchOptions(least=0.0))
+        [best] = find_instances(estimators, view, [model], found, SearchOptions(least=0.0))
         seconds.append((detected - started, time.perf_counter() - detected))
-        scores.append(best[0].score if best else 0.0)
+        scores.append(best.instances[0].score if best.instances else 0.0)
         print(f"{pictures[k]} {model.name}: {len(found)} detections, best estimate {scores[-1]:.2f}", flush=True)
     usual = SearchOptions().least
     for least in sorted({usual, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 0.9}):

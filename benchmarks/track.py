@@ -37,7 +37,7 @@ from posekit.evaluate.charts import Axes, lines
 from posekit.geometry import Pose, rotation_angle
 from posekit.metrics import pose_error
 from posekit.object_model import ObjectModel
-from posekit.results import Detection
+from posekit.results import Detection, Source
 from posekit.track import LOST, RESTARTED, TRACKED, TrackConfig, Tracked, Tracker
 from posekit.video import ReadAhead, SceneFrames, VideoFrames, VideoWriter
 from posekit.view import View
@@ -61,7 +61,7 @@ class TrueMasks:
             return []
         mask = self.instance.mask()
         box = mask_box(mask)
-        return [] if box is None else [Detection(box, mask, 1.0, models[0].name, "mask")]
+        return [] if box is None else [Detection(box, mask, 1.0, models[0].name, Source.MASK)]
 
 
 def beginnings(data: BopDataset, scene: int, images: Sequence[int]) -> dict[int, tuple[int, Pose]]:

@@ -37,7 +37,13 @@ LAYERS = {
 }
 ANYWHERE = {"errors", "_version"}
 # Fusion weighs what PnP alone solves. A camera turns rays; tracking and the search for instances are measured too.
-SIBLINGS = {("camera", "geometry"), ("fusion", "pnp"), ("evaluate", "track"), ("evaluate", "search")}
+SIBLINGS = {
+    ("camera", "geometry"),
+    ("fusion", "pnp"),
+    ("evaluate", "track"),
+    ("evaluate", "search"),
+    ("track", "search"),
+}
 SIBLINGS |= {
     ("mesh_files", "polygons"),
     ("lens", "camera"),

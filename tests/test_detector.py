@@ -38,8 +38,7 @@ from posekit.geometry import Pose, random_rotation, view_rotation
 from posekit.novel import LikenedDetector, NovelDetector
 from posekit.object_model import ObjectModel
 from posekit.render import Renderer
-from posekit.results import Detection, Estimate
-from posekit.search import SearchOptions, box_overlap, estimate_instances, estimates_of, judged
+from posekit.results import Detection, Source
 from posekit.train.config import MachineConfig, OptimiserConfig, SourceConfig, write_config
 from posekit.train.detector import DetectorConfig, DetectorModule, read_config, target, train_detector
 from posekit.view import View
@@ -387,46 +386,6 @@ def test_proposals_are_compared_with_the_mesh(renderer: Renderer, untrained: Tra
         NovelDetector(TrainedDetector(dataclasses.replace(TINY, classes=("cup",)), untrained.network), renderer)
 
 
-class _Estimator:
-    """Estimates as they are given."""
-
-    def __init__(self, scores: list[float], boxes: list[tuple[float, float, float, float]]) -> None:
-        self.found = [Estimate(Pose.identity(), 0.0, 1, True, s, b, "m") for s, b in zip(scores, boxes, strict=True)]
-
-    def estimate(self, view: View, detections: list[Detection], least: float = 0.0) -> list[Estimate]:
-        return [each for each in self.found if any(each.box == detection.box for detection in detections)]
-
-
-def test_instances_are_what_scores_and_does_not_overlap() -> None:
-    view = View(np.zeros((60, 80, 3), np.uint8), Camera.from_fov(1.0, 80, 60))
-    boxes = [(0.0, 0.0, 10.0, 10.0), (1.0, 0.0, 11.0, 10.0), (30.0, 0.0, 40.0, 10.0), (50.0, 0.0, 60.0, 10.0)]
-    estimator = _Estimator([0.6, 0.8, 0.5, 0.1], boxes)
-    detections = [Detection(box) for box in boxes]
-
-    def scores(options: SearchOptions) -> list[float]:
-        return [e.score for e in estimate_instances(estimator, view, detections, options)]  # type: ignore[arg-type]
-
-    assert scores(SearchOptions(instances=0, least=0.3)) == [0.8, 0.5]
-    assert scores(SearchOptions(instances=1, least=0.3)) == [0.8]
-    assert scores(SearchOptions(least=0.9)) == []
-    unlike, alike = (dataclasses.replace(detections[0], source="novel", score=s) for s in (0.46, 0.66))
-    found = [estimates_of(estimator, view, [each])[0].score for each in (unlike, alike)]  # type: ignore[arg-type]
-    np.testing.assert_allclose(found, [0.6 / (0.6 + 0.4 * np.exp(2)), 0.6 / (0.6 + 0.4 * np.exp(-2))])
-    assert box_overlap(boxes[0], boxes[1]) == pytest.approx(9 / 11)
-
-
-def test_detections_are_judged_by_their_poses() -> None:
-    a, b, c = (Detection((k, 0.0, k + 10.0, 10.0), None, 0.9 - 0.1 * k, "m", "novel") for k in range(3))
-    estimates = [
-        Estimate(Pose.identity(), 0.0, 1, True, score, found.box, "m", found) for score, found in ((0.2, a), (0.7, b))
-    ]
-    found = judged([a, b, c], estimates)
-    assert [(d.box, d.score) for d in found] == [(b.box, 0.7), (a.box, 0.2), (c.box, 0.0)]
-    trained = dataclasses.replace(b, source="mask-rcnn", score=0.5)
-    estimates = [Estimate(Pose.identity(), 0.0, 1, True, 0.7, trained.box, "m", trained)]
-    assert judged([trained], estimates)[0].score == pytest.approx(0.35)
-
-
 def test_looks_in_two_sizes_are_joined(untrained: TrainedDetector, monkeypatch: pytest.MonkeyPatch) -> None:
     masks = np.zeros((3, 60, 80), bool)
     masks[:, 5:20, 5:20] = True
@@ -459,7 +418,7 @@ def test_what_looks_like_the_mesh_counts_for_more(renderer: Renderer) -> None:
 
     class Trained:
         def detect(self, _: View, __: list) -> list[Detection]:
-            return [Detection(b, m, 0.4, "bracket", "mask-rcnn") for b, m in zip(boxes, masks, strict=True)]
+            return [Detection(b, m, 0.4, "bracket", Source.TRAINED) for b, m in zip(boxes, masks, strict=True)]
 
     view = View(image, camera)
     finder = LikenedDetector(Trained(), renderer, 0.5)  # type: ignore[arg-type]

@@ -283,7 +283,7 @@ def test_noise_is_the_instance_s_own(root: Path) -> None:
         starts.append([e["start"] for e in stage.run(2, 1)["estimates"]])
     assert starts[0] == starts[1]
     assert starts[0][0] != starts[0][1]
-    other = ImageStage(EvalOptions("refine", root=root, estimate=EstimateOptions(stop="fixed", iterations=1, seed=1)))
+    other = ImageStage(EvalOptions("refine", root=root, seed=1, estimate=EstimateOptions(stop="fixed", iterations=1)))
     assert [e["start"] for e in other.run(2, 1)["estimates"]] != starts[0]
 
 

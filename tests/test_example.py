@@ -13,7 +13,7 @@ from posekit.data.example import Example, locomotive, make_example, ply
 from posekit.geometry import Pose
 from posekit.object_model import ObjectModel
 from posekit.render import Renderer
-from posekit.results import Detection, Estimate, Step
+from posekit.results import Detection, Estimate, Source, Step
 from posekit.view import View
 
 
@@ -72,7 +72,7 @@ def estimate(example: Example, steps: int) -> Estimate:
     trace = tuple(
         Step(Pose(example.T_cam_obj.R, example.T_cam_obj.t + [0.002 * k, 0, 0]), 0.01 * k) for k in range(steps, 0, -1)
     )
-    detection = Detection(box=example.box, source="box+filled")
+    detection = Detection(box=example.box, source=Source.FILLED)
     return Estimate(example.T_cam_obj, 0.01, steps, True, 0.9, example.box, "locomotive", detection, trace)
 
 

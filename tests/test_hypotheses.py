@@ -19,7 +19,7 @@ from posekit.nets.pose_delta import delta_between
 from posekit.nets.weights import build
 from posekit.refine import crops
 from posekit.render import Light, Renderer
-from posekit.results import Detection
+from posekit.results import Detection, Source
 from posekit.view import View
 from posekit.zoom import zoom_to_box
 
@@ -37,7 +37,7 @@ def seen(renderer: Renderer, truth: Pose) -> tuple[View, Detection]:
     assert view.mask is not None
     box = mask_box(view.mask)
     assert box is not None
-    return View(view.image, CAMERA), Detection(box, view.mask, 1.0, "bracket", "mask")
+    return View(view.image, CAMERA), Detection(box, view.mask, 1.0, "bracket", Source.MASK)
 
 
 def test_the_search_finds_the_pose_among_its_best(renderer: Renderer) -> None:

@@ -17,8 +17,9 @@ from posekit.nets.pose_delta import PoseDelta, apply_delta, delta_between
 from posekit.nets.predictor import Correspondences, PairPrediction
 from posekit.object_model import ObjectModel
 from posekit.pnp import solve_pnp
-from posekit.refine import RefineOptions, refine
+from posekit.refine import Refinement, RefineOptions, refine
 from posekit.render import Renderer
+from posekit.results import Step
 from posekit.view import View
 
 CAMERA = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
@@ -167,6 +168,21 @@ def test_patience_ends_a_loop_that_no_longer_improves(renderer) -> None:
     assert found.iterations == 8 and not found.converged and found.angle == 0.1
 
 
+@pytest.mark.parametrize(("stop", "later_angle", "converged", "wins"), [
+    ("angle", 0.5, False, "first"), ("angle", 0.1, False, "later"), ("angle", 0.5, True, "later"),
+    ("fixed", 0.5, False, "later"),
+])  # fmt: skip
+def test_what_went_on_does_not_forget_a_better_pose(stop: str, later_angle: float, converged: bool, wins: str) -> None:
+    """The lowest predicted angle wins over all rounds."""
+    steps = [Step(Pose.translation([0.0, 0.0, float(k)]), 1.0) for k in range(3)]
+    first = Refinement(Pose.translation([1.0, 0, 0]), 0.2, 1, False, tuple(steps[:1]))
+    later = Refinement(Pose.translation([2.0, 0, 0]), later_angle, 2, converged, tuple(steps[1:]))
+    found = first.then(later, stop)
+    best = first if wins == "first" else later
+    assert found.T_cam_obj is best.T_cam_obj and found.angle == best.angle and found.converged == best.converged
+    assert found.iterations == 3 and found.trace == tuple(steps)
+
+
 def test_the_fixed_policy_takes_the_last_iterate(renderer) -> None:
     model = bracket()
     truth = Pose(view_rotation([0.5, -1.0, 0.6]), PLACES[0]) @ model.T_obj_ctr.inverse()
@@ -181,7 +197,7 @@ def test_an_update_that_the_predictor_cannot_give_is_refused(renderer) -> None:
     truth = Pose(view_rotation([0.5, -1.0, 0.6]), PLACES[0]) @ model.T_obj_ctr.inverse()
     oracle = Oracle(model, truth)
     oracle.dense = False
-    with pytest.raises(ConfigError, match="--update regression"):
+    with pytest.raises(ConfigError, match="the update is regression"):
         refine(photograph(renderer, model, truth), model, [truth], oracle, renderer)
 
 

@@ -15,7 +15,7 @@ from posekit.errors import OutputError, PromptError
 from posekit.files import write_bytes_atomic, write_text_atomic
 from posekit.geometry import Pose, random_rotation
 from posekit.load import load_pose
-from posekit.results import Detection, Estimate, Step, estimate_to_json, estimates_from_json, estimates_to_json
+from posekit.results import Detection, Estimate, Source, Step, estimate_to_json, estimates_from_json, estimates_to_json
 
 POSE = Pose(random_rotation(np.random.default_rng(0)), [0.1, -0.2, 0.9])
 
@@ -29,7 +29,7 @@ def estimate(angle: float = 0.02) -> Estimate:
         score=0.8,
         box=(1.0, 2.0, 30.5, 40.0),
         model="duck",
-        detection=Detection((0.0, 0.0, 32.0, 42.0), np.ones((4, 4), bool), 0.9, "duck", "mask"),
+        detection=Detection((0.0, 0.0, 32.0, 42.0), np.ones((4, 4), bool), 0.9, "duck", Source.MASK),
         trace=(Step(Pose.identity(), 0.4), Step(POSE, angle)),
         timings={"refine": 0.25, "total": 0.5},
     )

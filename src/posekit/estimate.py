@@ -23,15 +23,16 @@ from posekit.hypotheses import (
     poses_beside,
 )
 from posekit.nets.predictor import NetworkPredictor
-from posekit.nets.weights import load_networks
+from posekit.nets.weights import Networks, load_networks
 from posekit.object_model import ObjectModel
-from posekit.refine import Refinement, RefineOptions, compare, refine
+from posekit.refine import Refinement, RefineOptions, compare, predicted_angle, refine, update_pose
 from posekit.region import fit_outline
 from posekit.render import Renderer
-from posekit.results import Detection, Estimate
+from posekit.results import Branch, Detection, Estimate
 from posekit.view import View
 
 INITS = ("templates", "mvnet")
+AUTO = "auto"  # correspondences where the network gives them, else the regressed delta
 SILHOUETTE, STRUCTURE, BLUR, BIAS = 4.1, 8.0, 3.0, -2.3  # of `presence`, fitted: docs/decisions/0014
 USUAL = 2.0  # pixels of the crop: the correspondences' expected error, where the network gives none
 FIRST, SEMIFINALISTS, HEATS, FINALISTS = 1, 4, 3, 2  # iterations after which only so many hypotheses go on
@@ -45,16 +46,15 @@ class EstimateOptions:
     beside: whether poses beside a known
     one are tried too where it does not converge at once. contour: whether the pose is laid onto the mask's outline
     where the mask proves exact. outline: whether it is laid onto the one that the photograph's colours show where there
-    is no such mask. seed: for whatever is drawn at random. The rest is
-    RefineOptions', with the angle in degrees."""
+    is no such mask. update: what moves the pose, one of
+    RefineOptions' or AUTO. The rest is RefineOptions', with the angle in degrees."""
 
     init: str = "templates"
     hypotheses: int = 5
-    update: str = "correspondence"
+    update: str = AUTO
     stop: str = "angle"
     iterations: int = 50
     stop_angle_deg: float = 2.0
-    seed: int = 0
     beside: bool = True
     contour: bool = True
     outline: bool = True
@@ -64,16 +64,18 @@ class EstimateOptions:
             raise ConfigError(f"init is one of {INITS}, not {self.init!r}.")
         if self.hypotheses < 1:
             raise ConfigError(f"at least 1 hypothesis is needed, not {self.hypotheses}.")
-        _ = self.refine_options  # checks the rest
+        _ = self.refine_options(True)  # checks the rest
 
-    @property
-    def refine_options(self) -> RefineOptions:
-        return RefineOptions(self.update, self.stop, self.iterations, float(np.deg2rad(self.stop_angle_deg)))
+    def refine_options(self, dense: bool) -> RefineOptions:
+        """dense: whether the network gives correspondences."""
+        update = ("correspondence" if dense else "regression") if self.update == AUTO else self.update
+        return RefineOptions(update, self.stop, self.iterations, float(np.deg2rad(self.stop_angle_deg)))
 
 
 class PoseEstimator:
     """Estimates the pose of one object in photographs.
 
+    networks: where several estimators share them, in place of those that preset and weights name; see `Estimators`.
     Not thread-safe: one estimator per thread. Raises WeightsError where the preset has no weights.
     """
 
@@ -84,16 +86,12 @@ class PoseEstimator:
         preset: str = "lite",
         weights: Path | None = None,
         options: EstimateOptions = EstimateOptions(),
-        threads: int | None = None,
+        networks: Networks | None = None,
     ) -> None:
-        import torch
-
-        if threads is not None:
-            torch.set_num_threads(threads)
-        torch.manual_seed(options.seed)
         self.model, self.options = model, options
-        self.networks = load_networks(preset, weights)
+        self.networks = load_networks(preset, weights) if networks is None else networks
         self.predictor = NetworkPredictor(self.networks)
+        self.refine_options = options.refine_options(self.predictor.dense)
         self.renderer = Renderer()
         self._search: BoxSearch | MVNetSearch | None = None
         if options.init == "mvnet":
@@ -125,36 +123,38 @@ class PoseEstimator:
         """Refine a known pose; view.mask, where there is one, helps. Where it does not converge within a few
         iterations, the four poses turned by 12 degrees towards a tetrahedron's corners compete with it."""
         started = time.perf_counter()
-        options, judge = self.options.refine_options, self._judge_of(view, T_cam_obj)
+        options, judge = self.refine_options, self._judge_of(view, T_cam_obj)
         if self.options.beside and options.stop == "angle" and options.iterations > HEATS:
             heats = self._heats(view, [T_cam_obj])
             if not heats[0].converged:
                 heats += self._heats(view, poses_beside(T_cam_obj, self.model, BESIDE))
+            heats = self._on_outline(view, heats)
             refined = self._finals(view, judge, heats)
         else:
             refined = refine(view, self.model, [T_cam_obj], self.predictor, self.renderer, options)
         seconds = time.perf_counter() - started
-        return self._choose(view, judge, refined, None, {"refine": seconds, "total": seconds})
+        found = self._choose(view, judge, refined, None, {"refine": seconds, "total": seconds})
+        return nearest_to(T_cam_obj, found, self.model, Branch.GIVEN)
 
     def _refined(self, view: View, judge: Judge, starts: Sequence[Pose], least: float) -> list[Refinement]:
         """Every start for a few iterations, and the best of them to the end, unless its score is below ``least``."""
-        options = self.options.refine_options
+        options = self.refine_options
         if len(starts) <= FINALISTS or options.iterations <= HEATS:
             return refine(view, self.model, starts, self.predictor, self.renderer, options)
         heats = self._best(judge, self._on_outline(view, self._heats(view, starts, FIRST)), SEMIFINALISTS)
         heats = self._on_outline(view, self._onward(view, heats, HEATS - FIRST))
-        if least > 0 and self._presence(view, self._best(judge, heats, 1)[0].T_cam_obj) < least:
+        if least > 0 and self._last_look(view, self._best(judge, heats, 1)[0].T_cam_obj)[0] < least:
             return heats
         return self._finals(view, judge, heats)
 
     def _heats(self, view: View, starts: Sequence[Pose], iterations: int = HEATS) -> list[Refinement]:
-        short = replace(self.options.refine_options, iterations=iterations)
+        short = replace(self.refine_options, iterations=iterations)
         return refine(view, self.model, starts, self.predictor, self.renderer, short)
 
     def _finals(self, view: View, judge: Judge, heats: Sequence[Refinement]) -> list[Refinement]:
         """The best go on to the end."""
         finalists = self._best(judge, heats, FINALISTS)
-        return self._onward(view, finalists, self.options.refine_options.iterations - HEATS)
+        return self._onward(view, finalists, self.refine_options.iterations - HEATS)
 
     def _best(self, judge: Judge, heats: Sequence[Refinement], count: int) -> list[Refinement]:
         order = np.argsort([-s for s in self._scores(judge, heats)], kind="stable")
@@ -162,11 +162,11 @@ class PoseEstimator:
 
     def _onward(self, view: View, heats: Sequence[Refinement], iterations: int) -> list[Refinement]:
         """So many more; with the paper's policy only for what has not converged."""
-        options = replace(self.options.refine_options, iterations=iterations)
+        options = replace(self.refine_options, iterations=iterations)
         there = [heat.converged and options.stop == "angle" for heat in heats]
         poses = [heat.T_cam_obj for heat, done in zip(heats, there, strict=True) if not done]
         ends = iter(refine(view, self.model, poses, self.predictor, self.renderer, options))
-        return [heat if done else heat.then(next(ends)) for heat, done in zip(heats, there, strict=True)]
+        return [heat if done else heat.then(next(ends), options.stop) for heat, done in zip(heats, there, strict=True)]
 
     def first_poses(self, view: View, detection: Detection) -> list[Hypothesis]:
         """The first poses that ``options.init`` gives, best first; those for a detection's rough mask come last."""
@@ -188,13 +188,16 @@ class PoseEstimator:
         timings: dict[str, float],
     ) -> Estimate:
         """The hypothesis with the best score: much evidence in the photograph, and a low predicted angle."""
-        best = self._on_contour(view, self._best(judge, refined, 1)[0])
+        best, contour_std = self._on_contour(view, self._best(judge, refined, 1)[0])
+        presence, angle = self._last_look(view, best.T_cam_obj)
         return Estimate(
             T_cam_obj=best.T_cam_obj,
-            angle=best.angle,
+            angle=angle,
+            contour_std=contour_std,
             iterations=best.iterations,
-            converged=best.converged,
-            score=self._presence(view, best.T_cam_obj),
+            converged=(angle if contour_std is None else contour_std) < self.refine_options.stop_angle,
+            branch=Branch.ANY if self.model.symmetries else None,
+            score=presence,
             box=self._box(view, best.T_cam_obj),
             model=self.model.name,
             detection=detection,
@@ -202,15 +205,14 @@ class PoseEstimator:
             timings=timings,
         )
 
-    def _on_contour(self, view: View, refined: Refinement) -> Refinement:
-        """With its outline on the mask's, where there is an exact one; the angle is then the fit's. Else on the one
-        that the colours show."""
+    def _on_contour(self, view: View, refined: Refinement) -> tuple[Refinement, float | None]:
+        """With its outline on the mask's, where there is an exact one, and the fit's standard deviation. Else on the
+        one that the colours show, and None."""
         if self.options.contour and view.mask is not None:
             fit = fit_contour(view, self.model, refined.T_cam_obj, self.renderer)
             if fit is not None and fit.exact:
-                converged = fit.turn_std < self.options.refine_options.stop_angle
-                return replace(refined, T_cam_obj=fit.T_cam_obj, angle=fit.turn_std, converged=converged)
-        return self._on_outline(view, [refined])[0]
+                return replace(refined, T_cam_obj=fit.T_cam_obj), fit.turn_std
+        return self._on_outline(view, [refined])[0], None
 
     def _on_outline(self, view: View, refined: Sequence[Refinement]) -> list[Refinement]:
         """Each with its outline where the photograph's colours change; as it is where these do not tell."""
@@ -220,15 +222,19 @@ class PoseEstimator:
         poses = [fit_outline(view, self.model, r.T_cam_obj, self.renderer, size, r.angle) for r in refined]
         return [r if pose is None else replace(r, T_cam_obj=pose) for r, pose in zip(refined, poses, strict=True)]
 
-    def _presence(self, view: View, T_cam_obj: Pose) -> float:
-        """How sure it is that the photograph shows the object there: by what the network sees of it."""
+    def _last_look(self, view: View, T_cam_obj: Pose) -> tuple[float, float]:
+        """How sure it is that the photograph shows the object there, by what the network sees of it; and the rotation
+        error that the network predicts there, radians."""
         outline = self.model.outline - self.model.center
         [prediction], [observed], [rendered] = compare(
             view, self.model, outline, [T_cam_obj], self.predictor, self.renderer
         )
         found = prediction.correspondences
         error = float(np.median(found.scale_px)) if found is not None and len(found.scale_px) else USUAL
-        return presence(agreement_of(observed, rendered), error)
+        update = self.refine_options.update
+        updated = update_pose(T_cam_obj, self.model, prediction, observed, rendered, update)
+        angle = predicted_angle(T_cam_obj, prediction, updated, update)
+        return presence(agreement_of(observed, rendered), error), angle
 
     def _scores(self, judge: Judge, refined: Sequence[Refinement]) -> list[float]:
         evidence = judge.scores([r.T_cam_obj for r in refined])
@@ -242,6 +248,31 @@ class PoseEstimator:
         points = T_cam_obj.apply(self.model.outline)
         points[:, 2] = np.maximum(points[:, 2], 1e-3)
         return view.camera.points_box(points)
+
+
+class Estimators:
+    """One estimator for each mesh, all with the same networks; an estimator is made when it is first asked for.
+
+    Raises WeightsError where the preset has no weights.
+    """
+
+    def __init__(
+        self, *, preset: str = "lite", weights: Path | None = None, options: EstimateOptions = EstimateOptions()
+    ) -> None:
+        self.networks, self.options = load_networks(preset, weights), options
+        self._made: dict[ObjectModel, PoseEstimator] = {}
+
+    def __call__(self, model: ObjectModel) -> PoseEstimator:
+        if model not in self._made:
+            self._made[model] = PoseEstimator(model, options=self.options, networks=self.networks)
+        return self._made[model]
+
+
+def nearest_to(reference: Pose, estimate: Estimate, model: ObjectModel, branch: Branch) -> Estimate:
+    """An estimate of an object with symmetries in the equivalent pose nearest to a reference; others as they are."""
+    if not model.symmetries:
+        return estimate
+    return replace(estimate, T_cam_obj=model.symmetries.nearest(estimate.T_cam_obj, reference), branch=branch)
 
 
 def score(angle: float, evidence: float) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from posekit.camera import Box, Camera, Zoom
+from posekit.camera import Box, Camera
 from posekit.errors import PromptError, WeightsError
 from posekit.evidence import Palette, Picture, Silhouettes, Weights
 from posekit.geometry import (
@@ -23,7 +23,6 @@ from posekit.geometry import (
     cube_views,
     fibonacci_sphere,
     quat_to_rotation,
-    rotation_angle,
     rotation_between,
     so3_exp,
     view_rotation,
@@ -148,7 +147,7 @@ class TemplateSearch:
             row, column = np.unravel_index(flat, scores.shape)
             turn, patch = usable[int(row)]
             pose = self._pose(crop, turn, patch, int(column))
-            if all(rotation_angle(pose.R.T @ h.T_cam_obj.R) > self.options.apart for h in found):
+            if _is_apart(pose, found, self.model, self.options.apart):
                 found.append(Hypothesis(pose, float(scores[row, column])))
             if len(found) == count:
                 break
@@ -277,7 +276,8 @@ class BoxSearch:
         """
         zoom = box_window(view.camera, detection.box, FINER * self.options.side, self.options.root / self.options.side)
         masked = view.with_mask(detection.mask)
-        crop, shown = masked.zoomed(zoom), shown_in(view, zoom)
+        crop = masked.zoomed(zoom)
+        shown = crop.shown
         if not shown.any() or (detection.mask is not None and (crop.mask is None or not crop.mask.any())):
             return []
         palette = Palette(crop.image, shown)
@@ -297,7 +297,7 @@ class BoxSearch:
         found: list[Hypothesis] = []
         for k in np.argsort(-scores, kind="stable"):
             pose = self._pose(crop, self.placed[rows[k]], moves[k])
-            if all(rotation_angle(pose.R.T @ h.T_cam_obj.R) > self.options.apart for h in found):
+            if _is_apart(pose, found, self.model, self.options.apart):
                 found.append(Hypothesis(pose, float(scores[k])))
             if len(found) == count:
                 break
@@ -370,7 +370,8 @@ class Judge:
         """view: the photograph; its mask, where there is one, counts too. box: edges, round what the poses show."""
         self.model, self.renderer, self.weights = model, renderer, weights_for(model, weights)
         self.zoom = box_window(view.camera, box, JUDGED, BoxOptions.root / BoxOptions.side)
-        crop, shown = view.zoomed(self.zoom), shown_in(view, self.zoom)
+        crop = view.zoomed(self.zoom)
+        shown = crop.shown
         self.picture = Picture.of(crop.image, shown, Palette(crop.image, shown), crop.mask) if shown.any() else None
 
     def scores(self, poses: Sequence[Pose]) -> list[float]:
@@ -421,6 +422,13 @@ class MVNetSearch:
     def frontal(self, crop_camera: Camera) -> Pose:
         """The ``T_view_ctr`` to which MV-Net's answer is relative."""
         return frontal_pose(self.camera, self.distance, crop_camera)
+
+
+def _is_apart(pose: Pose, found: Sequence[Hypothesis], model: ObjectModel, angle: float) -> bool:
+    """Whether a ``T_cam_obj`` is further than ``angle`` from all that were found, and from all that look the same."""
+    if not found:
+        return True
+    return bool((model.symmetries.angles(pose.R, np.stack([h.T_cam_obj.R for h in found])) > angle).all())
 
 
 def poses_beside(T_cam_obj: Pose, model: ObjectModel, angle: float) -> list[Pose]:
@@ -481,12 +489,6 @@ def weights_for(model: ObjectModel, weights: Weights) -> Weights:
     """Without the colour agreement for a mesh without colours: its shading depends on a light that nobody knows."""
     plain = model.colors is None and model.texture is None
     return replace(weights, agreement=0.0) if plain else weights
-
-
-def shown_in(view: View, zoom: Zoom) -> NDArray[np.bool_]:
-    """Where (H, W) a zoomed picture shows the photograph."""
-    ones = np.ones((view.camera.height, view.camera.width), np.uint8)
-    return np.asarray(cv2.warpPerspective(ones, zoom.homography, zoom.camera.size, flags=cv2.INTER_NEAREST) > 0)
 
 
 def box_mask(box: tuple[float, float, float, float], camera: Camera) -> NDArray[np.bool_]:

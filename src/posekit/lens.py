@@ -64,6 +64,11 @@ class Lens:
         """A photograph (H, W, 3) as `ideal` sees it; black where it shows nothing."""
         return np.asarray(cv2.remap(image, *_maps(self), cv2.INTER_LINEAR), dtype=np.uint8)
 
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Which pixels (H, W) of `ideal` the photograph shows."""
+        return _valid(self)
+
     def undistorted_mask(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """A mask (H, W) of the photograph as one of `ideal`. Raises CameraError where its size is another."""
         if mask.shape != (self.camera.height, self.camera.width):
@@ -117,6 +122,12 @@ def _border(camera: Camera) -> Array:
     y = np.append(np.arange(0, camera.height - 1, _STEP), camera.height - 1)
     sides = [(u, v) for u in x for v in (0, camera.height - 1)] + [(u, v) for v in y for u in (0, camera.width - 1)]
     return np.array(sides, dtype=np.float64)
+
+
+@lru_cache(maxsize=4)
+def _valid(lens: Lens) -> NDArray[np.bool_]:
+    whole = np.ones((lens.camera.height, lens.camera.width), np.float32)
+    return np.asarray(cv2.remap(whole, *_maps(lens), cv2.INTER_LINEAR) > 0.99)
 
 
 @lru_cache(maxsize=4)

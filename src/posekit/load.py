@@ -45,7 +45,8 @@ def load_view(image: str | Path, camera: str | Path | None = None) -> View:
     """
     pixels = load_image(image)
     found = calibration_of(image, (pixels.shape[1], pixels.shape[0]), camera)
-    return View(found.undistorted(pixels), found.ideal, lens=found.lens)
+    valid = None if found.lens is None else found.lens.valid
+    return View(found.undistorted(pixels), found.ideal, lens=found.lens, valid=valid)
 
 
 def calibration_of(image: str | Path, size: Size, camera: str | Path | None = None) -> Calibration:

@@ -31,7 +31,7 @@ from posekit.geometry import Pose, fibonacci_sphere, view_rotation
 from posekit.hypotheses import TemplateSearch
 from posekit.object_model import ObjectModel
 from posekit.render import Light, Renderer
-from posekit.results import Detection
+from posekit.results import Detection, Source
 from posekit.view import View
 from posekit.zoom import zoom_to_box
 
@@ -184,7 +184,7 @@ class NovelDetector:
         masks = np.concatenate([look.masks for look in looks])
         kept = torchvision().ops.nms(torch.from_numpy(boxes), torch.from_numpy(scores), options.same).numpy()
         return [
-            Detection((float(x0), float(y0), float(x1), float(y1)), mask, float(score), None, "novel")
+            Detection((float(x0), float(y0), float(x1), float(y1)), mask, float(score), None, Source.NOVEL)
             for (x0, y0, x1, y1), mask, score in zip(boxes[kept], masks[kept], scores[kept], strict=True)
         ]
 
@@ -202,7 +202,7 @@ class NovelDetector:
             if score < self.options.least or len(kept) == self.options.most:
                 break
             if all(_overlap(proposal, other) < self.options.overlap for other in kept):
-                kept.append(Detection(proposal.box, proposal.mask, score, model.name, "novel"))
+                kept.append(Detection(proposal.box, proposal.mask, score, model.name, Source.NOVEL))
         return kept
 
 
@@ -271,14 +271,11 @@ def make_detector(
     least: float | None = None,
     most: int = 3,
     doubtful: bool = False,
-    threads: int | None = None,
 ) -> tuple[Detector, tuple[str, ...]]:
     """A network's Detector and the names that its detections may have. name: "novel" (the default), "coco", or a
     trained detector's file or folder. most: detections of a mesh. doubtful: whether poses will judge the detections, so
     that trained detectors' doubtful ones are wanted too, and no more than ``most``. Raises WeightsError, ConfigError.
     """
-    if threads is not None:
-        torch.set_num_threads(threads)
     file = SHIPPED if name is None or name == ANY else Path(name)
     trained = load_coco() if name == COCO else load_detector(file)
     if not trained.config.novel:

@@ -23,7 +23,7 @@ from scipy.spatial import ConvexHull, KDTree
 from scipy.spatial.distance import pdist
 
 from posekit.errors import MeshError
-from posekit.geometry import Pose, fibonacci_sphere, so3_exp
+from posekit.geometry import Pose, fibonacci_sphere, hat, rotation_angle, so3_exp
 from posekit.mesh_files import ply_colours, ply_faces, put_right
 from posekit.pixels import deep_colour, eight_bit
 
@@ -133,6 +133,36 @@ class Symmetries:
         angles = np.arange(1, max_steps) * (2 * np.pi / max_steps)
         turns = [Pose.identity(), *(c.turn(a) for c in self.continuous for a in angles)]
         return [turn @ still for turn in turns for still in discrete]
+
+    def __bool__(self) -> bool:
+        """Whether there is one."""
+        return bool(self.discrete or self.continuous)
+
+    def nearest(self, T_a_obj: Pose, reference: Pose) -> Pose:
+        """Of the poses in which the object looks as in ``T_a_obj``, the one with the rotation nearest to the
+        reference's. About continuous axes it is exact where there is one of them, else as fine as `transforms`."""
+        if not self:
+            return T_a_obj
+        exact = len(self.continuous) == 1
+        turns = self.discrete if exact else self.transforms()[1:]
+        candidates = [T_a_obj, *(T_a_obj @ S for S in turns)]
+        if exact:
+            candidates = [pose @ self.continuous[0].turn(_turn_towards(pose, reference, self.continuous[0].axis))
+                          for pose in candidates]  # fmt: skip
+        return max(candidates, key=lambda pose: float(np.trace(reference.R.T @ pose.R)))
+
+    def angles(self, R: Floats, others: Floats) -> Floats:
+        """Angle (N,), radians, from R_a_obj (3, 3) to each of others (N, 3, 3), to the nearest of the equivalent ones;
+        continuous axes in steps of 10 degrees."""
+        equivalent = np.stack([R @ S.R for S in self.transforms(36)])
+        return np.asarray(rotation_angle(np.swapaxes(others, -1, -2)[:, None] @ equivalent).min(axis=1))
+
+
+def _turn_towards(pose: Pose, reference: Pose, axis: Floats) -> float:
+    """The angle of the turn about an axis in ``obj`` that brings a pose's rotation nearest to the reference's."""
+    # trace(M exp(a hat(axis))) = axis' M axis + cos(a) (trace M - axis' M axis) + sin(a) trace(M hat(axis))
+    M = reference.R.T @ pose.R
+    return float(np.arctan2(np.trace(M @ hat(axis)), np.trace(M) - axis @ M @ axis))
 
 
 def _turn_about(R: Floats, point: Floats) -> Pose:

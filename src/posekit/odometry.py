@@ -54,7 +54,7 @@ class Look:
     def corners(self) -> NDArray[np.float32]:
         """Pixels (N, 1, 2) of the object that can be followed into the next frame."""
         assert self.drawn.mask is not None
-        solid = self.drawn.mask & self.visible & (self.grey > 0)
+        solid = self.drawn.mask & self.visible & self.seen.shown
         inside = cv2.erode(solid.astype(np.uint8), np.ones((5, 5), np.uint8))
         corners = cv2.goodFeaturesToTrack(self.grey, CORNERS, QUALITY, APART, mask=inside)
         return np.zeros((0, 1, 2), np.float32) if corners is None else np.asarray(corners, np.float32)
@@ -83,7 +83,7 @@ def follow_points(before: Look, pose: Pose, after: View, model: ObjectModel) -> 
     drawn, camera, corners = before.drawn, before.drawn.camera, before.corners
     assert drawn.mask is not None and drawn.coords is not None
     second = cv2.cvtColor(after.image, cv2.COLOR_RGB2GRAY)
-    shown = cv2.erode((second > 0).astype(np.uint8), np.ones((5, 5), np.uint8))
+    shown = cv2.erode(after.shown.astype(np.uint8), np.ones((5, 5), np.uint8))
     corners = corners[shown[tuple(corners[:, 0].astype(int).T[::-1])] > 0]
     if len(corners) < LEAST:
         return None

@@ -74,10 +74,12 @@ class Refinement:
     converged: bool
     trace: tuple[Step, ...]
 
-    def then(self, later: Refinement) -> Refinement:
-        """This one and what followed when it went on from its pose."""
-        iterations = self.iterations + later.iterations
-        return replace(later, iterations=iterations, trace=self.trace + later.trace)
+    def then(self, later: Refinement, stop: str) -> Refinement:
+        """This one and what followed when it went on from its pose. With the policy ``angle`` the lowest predicted
+        angle of both wins, unless the later one converged; with ``fixed`` the later one does."""
+        earlier = stop == "angle" and not later.converged and self.angle < later.angle
+        best = self if earlier else later
+        return replace(best, iterations=self.iterations + later.iterations, trace=self.trace + later.trace)
 
 
 def refine(
@@ -94,7 +96,7 @@ def refine(
     Raises ConfigError where the update needs correspondences and the predictor gives none.
     """
     if options.update == "correspondence" and not predictor.dense:
-        raise ConfigError("this preset predicts no correspondences: use --update regression.")
+        raise ConfigError("this preset predicts no correspondences: the update is regression (--update regression).")
     outline = model.outline - model.center
     loops = [_Loop(start) for start in starts]
     for _ in range(options.iterations):

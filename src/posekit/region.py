@@ -240,7 +240,7 @@ def _pixels(places: FArray, view: View) -> tuple[NDArray[np.intp], Mask]:
     """Nearest pixels (..., 2), and whether they lie in the photograph."""
     nearest = np.rint(places).astype(np.intp)
     clipped = np.clip(nearest, 0, np.array(view.camera.size) - 1)
-    inside = (nearest == clipped).all(axis=-1) & view.image[clipped[..., 1], clipped[..., 0]].any(axis=-1)
+    inside = (nearest == clipped).all(axis=-1) & view.shown[clipped[..., 1], clipped[..., 0]]
     return clipped, inside
 
 

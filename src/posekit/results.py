@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,34 @@ from posekit.errors import PromptError
 from posekit.geometry import Pose
 
 
+class Source(StrEnum):
+    """Where a detection comes from."""
+
+    BOX = "box"  # a person's box
+    GRABCUT = "box+grabcut"  # a person's box, with GrabCut's mask
+    FILLED = "box+filled"  # a person's box, taken as the mask
+    MASK = "mask"  # a person's mask
+    FILE = "file"  # another program's result
+    NOVEL = "novel"  # the detector for any mesh; its score is the similarity to the mesh
+    TRAINED = "mask-rcnn"  # a detector that was trained for its classes
+
+    @property
+    def by_hand(self) -> bool:
+        """Whether a person says where the object is."""
+        return self in (Source.BOX, Source.GRABCUT, Source.FILLED, Source.MASK)
+
+    @property
+    def given(self) -> bool:
+        """Whether somebody else vouches for the detection: a person, or another program."""
+        return self.by_hand or self is Source.FILE
+
+
 @dataclass(frozen=True, eq=False)
 class Detection:
     """Where an object is in a picture.
 
     box: edges, pixels. mask: bool (H, W), of the picture's size, or None. score: in [0, 1]. label: the object's
-    name, where it is known. source: what found it, such as "box+grabcut" or "mask". rough: a network's own mask, where
+    name, where it is known. source: what found it. rough: a network's own mask, where
     ``mask`` is that one laid onto the picture's colours: first poses are sought for both.
     """
 
@@ -31,7 +54,7 @@ class Detection:
     mask: NDArray[np.bool_] | None = None
     score: float = 1.0
     label: str | None = None
-    source: str = "box"
+    source: Source = Source.BOX
     rough: NDArray[np.bool_] | None = None
 
 
@@ -43,14 +66,24 @@ class Step:
     angle: float
 
 
+class Branch(StrEnum):
+    """Which of the poses in which a symmetric object looks the same was taken."""
+
+    ANY = "any"  # there was nothing to choose by
+    GIVEN = "given"  # the one nearest to the pose that was given
+    LAST = "last"  # the one nearest to the last frame's
+
+
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """An object's pose in a photograph.
 
-    angle: predicted rotation error, radians. iterations: used for this result. converged: whether the angle fell
-    below the threshold. score: in [0, 1], how likely the object is there in this pose. box: of the object at this pose,
-    edges, pixels. model: the mesh's name. detection: what it started from. trace: the poses on the way, first to last.
-    timings: seconds by stage.
+    angle: the rotation error, radians, that the network predicts for T_cam_obj itself; for a tracked frame, for the
+    pose at which the frame was compared. contour_std: where the pose was laid onto an exact mask's outline, the
+    standard deviation of its rotation, radians. iterations: used for this result. converged: whether contour_std, or
+    else the angle, is below the threshold. branch: None for an object without symmetries. score: in [0, 1], how likely
+    the object is there in this pose. box: of the object at this pose, edges, pixels. model: the mesh's name.
+    detection: what it started from. trace: the poses on the way, first to last. timings: seconds by stage.
     """
 
     T_cam_obj: Pose
@@ -63,6 +96,8 @@ class Estimate:
     detection: Detection | None = None
     trace: tuple[Step, ...] = ()
     timings: Mapping[str, float] = field(default_factory=dict)
+    contour_std: float | None = None
+    branch: Branch | None = None
 
 
 def estimates_to_json(
@@ -115,11 +150,13 @@ def _estimate_to_dict(estimate: Estimate) -> dict[str, Any]:
         "t_m": estimate.T_cam_obj.t.tolist(),
         "angle_deg": math.degrees(estimate.angle),
         "iterations": estimate.iterations,
+        "contour_std_deg": None if estimate.contour_std is None else math.degrees(estimate.contour_std),
         "converged": estimate.converged,
+        "branch": None if estimate.branch is None else estimate.branch.value,
         "score": estimate.score,
         "box": list(estimate.box),
         "detection": found
-        and {"box": list(found.box), "score": found.score, "label": found.label, "source": found.source},
+        and {"box": list(found.box), "score": found.score, "label": found.label, "source": found.source.value},
         "trace": [
             {"T_cam_obj": step.T_cam_obj.matrix.tolist(), "angle_deg": math.degrees(step.angle)}
             for step in estimate.trace
@@ -139,9 +176,11 @@ def _estimate_from_dict(entry: Mapping[str, Any]) -> Estimate:
         box=_box(entry["box"]),
         model=entry["model"],
         detection=found
-        and Detection(_box(found["box"]), None, _number(found["score"]), found["label"], found["source"]),
+        and Detection(_box(found["box"]), None, _number(found["score"]), found["label"], Source(found["source"])),
         trace=tuple(Step(Pose.from_matrix(s["T_cam_obj"]), _radians(s["angle_deg"])) for s in entry["trace"]),
         timings={stage: _number(seconds) for stage, seconds in entry["timings_s"].items()},
+        contour_std=None if entry.get("contour_std_deg") is None else _radians(entry["contour_std_deg"]),
+        branch=None if entry.get("branch") is None else Branch(entry["branch"]),
     )
 
 

@@ -11,7 +11,7 @@ import math
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from posekit.camera import Camera
 from posekit.errors import CameraError, ConfigError
-from posekit.estimate import PoseEstimator
+from posekit.estimate import PoseEstimator, nearest_to
 from posekit.fusion import Belief, Points, Term, fuse
 from posekit.geometry import Pose, rotation_angle, so3_exp, so3_log
 from posekit.nets.pose_delta import apply_delta
@@ -29,7 +29,8 @@ from posekit.object_model import ObjectModel
 from posekit.odometry import Look, follow_points, match_texture
 from posekit.refine import crops
 from posekit.region import Colours, Tint, learn, like_mesh, off_colour, outline_lines
-from posekit.results import Detection, Estimate
+from posekit.results import Branch, Detection, Estimate
+from posekit.search import SearchOptions, find_instances
 from posekit.view import View
 
 TRACKED, RESTARTED, LOST = "tracked", "restarted", "lost"
@@ -55,7 +56,8 @@ class Finder(Protocol):
 @dataclass(frozen=True)
 class TrackConfig:
     """restart_deg, still_deg: predicted angles above which a frame is in doubt, and below which the network leaves the
-    pose to points and outline, both degrees. iterations: comparisons of a frame at most; a second one follows a turn of
+    pose to points and outline, both degrees. converged_deg: the predicted angle below which an estimate says
+    that it converged. iterations: comparisons of a frame at most; a second one follows a turn of
     more than ``again_deg``. motion: where a frame's comparison starts: where followed points lead ("points"), the share
     ``prior`` of the last motion once more ("velocity"), or the last pose ("none"). outline, texture: whether the
     colours' place of the outline counts, and the mesh's texture where the frame shows it. mask: what a frame's mask is
@@ -63,10 +65,11 @@ class TrackConfig:
     keep: share of what was known that holds for the next frame. alike: share of the silhouette with the object's
     colours, below which a frame is in doubt. learn: share of a frame in these colours. least_inside: share of the
     silhouette's box in the picture, likewise. doubts: frames in doubt in a row after which the object is lost. search:
-    frames between two attempts to find it. first: least score of a first pose. runtime: of the network."""
+    frames between two attempts to find it. runtime: of the network."""
 
     restart_deg: float = 25.0
     still_deg: float = 0.0
+    converged_deg: float = 2.0
     again_deg: float = 8.0
     iterations: int = 1
     motion: str = "points"
@@ -80,7 +83,6 @@ class TrackConfig:
     least_inside: float = 0.3
     doubts: int = 3
     search: int = 5
-    first: float = 0.35
     runtime: str = "openvino"
 
     def __post_init__(self) -> None:
@@ -91,8 +93,8 @@ class TrackConfig:
             )
         if min(self.iterations, self.doubts, self.search) < 1:
             raise ConfigError("iterations, doubts and search are at least 1.")
-        if not all(0 <= share <= 1 for share in (self.prior, self.alike, self.learn, self.least_inside, self.first)):
-            raise ConfigError("prior, alike, learn, least_inside and first are shares between 0 and 1.")
+        if not all(0 <= share <= 1 for share in (self.prior, self.alike, self.learn, self.least_inside)):
+            raise ConfigError("prior, alike, learn and least_inside are shares between 0 and 1.")
         if not 0 < self.keep <= 1:
             raise ConfigError(f"keep is a share above 0, at most 1, not {self.keep:g}.")
         for name, known in (("mask", MASKS), ("motion", MOTIONS), ("runtime", RUNTIMES)):
@@ -149,6 +151,7 @@ class Tracker:
         self._outline = model.outline - model.center
         self._beside = ThreadPoolExecutor(1, "posekit-network")
         self._given = pose  # a first pose that no frame has been seen with
+        self._told = pose  # the last ``T_cam_obj`` that was told, whether or not the object was lost since
         self._belief: Belief | None = None  # ``T_cam_ctr``
         self._motion = Pose.identity()  # of the object's centre and axes, from the frame before the last to the last
         self._before: Look | None = None
@@ -157,21 +160,28 @@ class Tracker:
         self._doubts = 0
         self._waiting = 0  # frames until the next search
 
-    def step(self, image: NDArray[np.uint8], camera: Camera | None = None) -> Tracked:
-        """The object in the next frame. image: uint8 RGB (H, W, 3). Raises CameraError where no camera is known."""
+    def step(
+        self, image: NDArray[np.uint8], camera: Camera | None = None, valid: NDArray[np.bool_] | None = None
+    ) -> Tracked:
+        """The object in the next frame. image: uint8 RGB (H, W, 3). valid: as a `View` has it.
+
+        Raises CameraError where no camera is known."""
         chosen = camera or self.camera
         if chosen is None:
             raise CameraError("the tracker was made without a camera: pass one with each frame.")
-        view = View(image, chosen)
+        view = View(image, chosen, valid=valid)
         if self._given is not None:
             started, pose, self._given = time.perf_counter(), self._given, None
             if self._begin(view, pose, math.radians(GIVEN[0])):
-                timings = {"network": 0.0, "total": time.perf_counter() - started}
-                return Tracked(TRACKED, self._estimate(view, pose, math.radians(GIVEN[0]), 0, 1.0, timings))
+                assert self._before is not None
+                prediction, network = self._asked(self._before.seen, self._before.drawn, self._before.visible)
+                timings = {"network": network, "total": time.perf_counter() - started}
+                given = self._estimate(view, pose, prediction.angle, 0, 1.0, timings)
+                return Tracked(TRACKED, self._on_branch(given, Branch.GIVEN))
         if self._belief is not None:
             found = self._follow(view, self._belief)
             if found is not None and not self._lost_sight(view, found):
-                return Tracked(TRACKED, found)
+                return Tracked(TRACKED, self._on_branch(found))
             self._lose()
         return self._find(view)
 
@@ -328,10 +338,20 @@ class Tracker:
         self, view: View, pose: Pose, angle: float, iterations: int, score: float, timings: dict[str, float]
     ) -> Estimate:
         box = view.camera.points_box(_before_camera(pose.apply(self.model.outline)))
-        return Estimate(pose, angle, iterations, True, score, box, self.model.name, timings=timings)
+        converged = angle < math.radians(self.config.converged_deg)
+        return Estimate(pose, angle, iterations, converged, score, box, self.model.name, timings=timings)
 
     def _in_front(self, pose: Pose) -> bool:
         return bool(np.isfinite(pose.matrix).all() and pose.apply(self.model.center)[2] > NEAR * self.model.diameter)
+
+    def _on_branch(self, found: Estimate, branch: Branch = Branch.LAST) -> Estimate:
+        """Of equivalent poses the one nearest to the last one that was told, where there is one."""
+        if self._told is not None:
+            found = nearest_to(self._told, found, self.model, branch)
+        elif self.model.symmetries:
+            found = replace(found, branch=Branch.ANY)
+        self._told = found.T_cam_obj
+        return found
 
     # --- losing and finding ---
 
@@ -359,12 +379,13 @@ class Tracker:
         if self.detector is None or self._waiting > 0:
             return Tracked(LOST)
         self._waiting = self.config.search
-        detections = [d for d in self.detector.detect(view, [self.model]) if d.label in (None, self.model.name)]
-        found = max(self.estimator.estimate(view, detections, self.config.first), key=lambda e: e.score, default=None)
-        if found is None or found.score < self.config.first or not self._begin(view, found.T_cam_obj, found.angle):
+        detections = self.detector.detect(view, [self.model])
+        # nobody vouches for every frame's detections: poses must be borne out, whoever detects
+        [found] = find_instances(lambda _: self.estimator, view, [self.model], detections, SearchOptions())
+        if not found.instances or not self._begin(view, found.instances[0].T_cam_obj, found.instances[0].angle):
             return Tracked(LOST)
         self._waiting = 0
-        return Tracked(RESTARTED, found)
+        return Tracked(RESTARTED, self._on_branch(found.instances[0]))
 
 
 def _about(pose: Pose, camera: Camera, spread: tuple[float, float, float]) -> Belief:

@@ -39,12 +39,13 @@ MOST_FAILURES = 100  # frames of a camera or video that may fail one after the o
 class Frame:
     """number: in the source, from 0, or the picture's own in a BOP scene. image: uint8 RGB (H, W, 3), None where it
     could not be decoded, and ``problem`` says why. camera: of this frame, where it is known; where it has lens
-    distortion, image and camera are the undistorted ones. seconds: since the start, where known. scene: of a BOP scene,
-    else 0. file: the picture's name, where it is one."""
+    distortion, image and camera are the undistorted ones. valid: (H, W), which pixels the frame shows; None = all.
+    seconds: since the start, where known. scene: of a BOP scene, else 0. file: the picture's name, where it is one."""
 
     number: int
     image: Image | None
     camera: Camera | None = None
+    valid: NDArray[np.bool_] | None = None
     seconds: float | None = None
     problem: str = ""
     scene: int = 0
@@ -108,10 +109,12 @@ class _Intrinsics:
         self.each = camera is not None and depends_on_picture(camera)
         self.told = False
 
-    def seen(self, image: Image, path: Path | None = None) -> tuple[Image, Camera]:
-        """The undistorted picture and its camera. Raises CameraError where the given camera does not fit."""
+    def seen(self, image: Image, path: Path | None = None) -> tuple[Image, Camera, NDArray[np.bool_] | None]:
+        """The undistorted picture, its camera, and which pixels it shows (None = all).
+
+        Raises CameraError where the given camera does not fit."""
         found = self._of((image.shape[1], image.shape[0]), path)
-        return found.undistorted(image), found.ideal
+        return found.undistorted(image), found.ideal, None if found.lens is None else found.lens.valid
 
     def _of(self, size: tuple[int, int], path: Path | None) -> Calibration:
         if self.given is not None:
@@ -145,8 +148,8 @@ class PictureFrames:
     def __iter__(self) -> Iterator[Frame]:
         for number, path in enumerate(self.paths):
             try:
-                image, camera = self._cameras.seen(load_image(path), path)
-                yield Frame(number, image, camera, number / self.rate, file=path.name)
+                image, camera, valid = self._cameras.seen(load_image(path), path)
+                yield Frame(number, image, camera, valid, number / self.rate, file=path.name)
             except InputError as error:
                 yield Frame(number, None, problem=str(error), file=path.name)
 
@@ -173,7 +176,7 @@ class SceneFrames:
                 path = self._path(number)
                 image = load_image(path)
                 camera = Camera.from_K(np.reshape(entry["cam_K"], (3, 3)), image.shape[1], image.shape[0])
-                yield Frame(number, image, camera, place / self.rate, scene=self.scene, file=path.name)
+                yield Frame(number, image, camera, None, place / self.rate, scene=self.scene, file=path.name)
             except (InputError, KeyError, ValueError, TypeError) as error:
                 yield Frame(number, None, problem=str(error), scene=self.scene)
 

@@ -20,6 +20,7 @@ class View:
     mask: bool (H, W), the object's pixels. depth: float32 (H, W), metres along z, 0 = nothing.
     coords: float32 (H, W, 3), object coordinates in metres, 0 = nothing.
     R_view_cam: (3, 3), from the photograph's camera frame into this view's (identity unless zoomed).
+    valid: bool (H, W), which pixels show something rather than what lies outside the photograph; None = all of them.
     lens: where this is an undistorted photograph, the lens that it was taken through.
     """
 
@@ -30,18 +31,19 @@ class View:
     coords: NDArray[np.float32] | None = None
     R_view_cam: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
     lens: Lens | None = None
+    valid: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         size = (self.camera.height, self.camera.width)
-        for name in ("image", "mask", "depth", "coords"):
+        for name in ("image", "mask", "depth", "coords", "valid"):
             array = getattr(self, name)
             if array is not None and array.shape[:2] != size:
                 raise ValueError(f"View: {name} is {array.shape[:2]}, its camera {size} (height, width)")
 
     @property
     def shown(self) -> NDArray[np.bool_]:
-        """Pixels (H, W) that are not black: what lies outside a zoomed photograph is."""
-        return np.asarray(cv2.cvtColor(self.image, cv2.COLOR_RGB2GRAY) > 0)
+        """Pixels (H, W) that show something: `valid`, all of them where it is None."""
+        return np.ones(self.image.shape[:2], np.bool_) if self.valid is None else self.valid
 
     def with_mask(self, mask: NDArray[np.bool_] | None) -> View:
         return replace(self, mask=mask)
@@ -49,7 +51,7 @@ class View:
     def zoomed(self, zoom: Zoom) -> View:
         """The picture and the mask resampled into ``zoom.camera``; depth and coords are dropped.
 
-        Pixels from outside the photograph are black and not in the mask. Where the zoom shrinks the
+        Pixels from outside the photograph are black, not valid and not in the mask. Where the zoom shrinks the
         picture it is smoothed first, so that small details do not alias.
         """
         size, H = zoom.camera.size, zoom.homography
@@ -62,4 +64,16 @@ class View:
         if self.mask is not None:
             soft = cv2.warpPerspective(self.mask.astype(np.float32), H, size, flags=cv2.INTER_LINEAR)
             mask = soft > 0.5
-        return View(image, zoom.camera, mask, R_view_cam=zoom.R_view_cam @ self.R_view_cam)
+        return View(image, zoom.camera, mask, R_view_cam=zoom.R_view_cam @ self.R_view_cam, valid=self._valid_in(zoom))
+
+    def _valid_in(self, zoom: Zoom) -> NDArray[np.bool_] | None:
+        """Which pixels of a zoomed picture take their colour from valid ones alone; None where all do."""
+        width, height = zoom.camera.size
+        corners = np.array([[0, 0, 1], [width - 1, 0, 1], [0, height - 1, 1], [width - 1, height - 1, 1]], np.float64)
+        there = corners @ np.linalg.inv(zoom.homography).T
+        if self.valid is None and (there[:, 2] > 0).all():
+            places = there[:, :2] / there[:, 2:]
+            if (places >= 0).all() and (places <= np.array(self.camera.size) - 1).all():
+                return None
+        valid = self.shown.astype(np.float32)
+        return np.asarray(cv2.warpPerspective(valid, zoom.homography, zoom.camera.size, flags=cv2.INTER_LINEAR) > 0.99)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from posekit.cli.options import ForceOption, SeedOption, WeightsOption
+from posekit.cli.options import ForceOption, WeightsOption
 
 
 def demo(
@@ -16,7 +16,7 @@ def demo(
         "posekit-out/demo"
     ),
     weights: WeightsOption = None,
-    seed: SeedOption = 0,
+    seed: Annotated[int, typer.Option(help="Of the example.")] = 0,
     force: ForceOption = False,
 ) -> None:
     """Estimate a pose in an example that is made on the spot, and compare it with the truth."""
@@ -30,14 +30,14 @@ def demo(
     from posekit import draw
     from posekit.data.example import make_example, ply
     from posekit.detect import BoxPrompt
-    from posekit.estimate import EstimateOptions, PoseEstimator
+    from posekit.estimate import PoseEstimator
     from posekit.metrics import pose_error
     from posekit.render import Renderer
 
     with destination.working("making the example"):
         example = make_example(Renderer(), seed)
     with destination.working("loading the networks"):
-        estimator = PoseEstimator(example.model, weights=weights, options=EstimateOptions(seed=seed))
+        estimator = PoseEstimator(example.model, weights=weights)
     with destination.working("estimating"):
         detections = BoxPrompt(example.box).detect(example.view, [example.model])
         estimates = estimator.estimate(example.view, detections)
@@ -48,7 +48,7 @@ def demo(
     for estimate in estimates:
         turn, shift = pose_error(estimate.T_cam_obj, example.T_cam_obj)
         typer.echo(f"    true error {np.rad2deg(turn):.1f} degrees, {1000 * shift:.0f} mm")
-    command = ["posekit", "estimate", str(photo), "--model", str(mesh), "--units", "m", "--seed", str(seed)]
+    command = ["posekit", "estimate", str(photo), "--model", str(mesh), "--units", "m"]
     command += ["--camera", _numbers(camera.fx, camera.fy, camera.cx, camera.cy), "--box", _numbers(*example.box)]
     command += ["--weights", str(weights)] if weights else []
     typer.echo(f"the same by hand: {shlex.join(command)}")

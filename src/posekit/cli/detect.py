@@ -19,6 +19,7 @@ from posekit.cli.options import (
     OutOption,
     ThreadsOption,
     UnitsOption,
+    use_threads,
 )
 
 if TYPE_CHECKING:
@@ -44,9 +45,6 @@ def detect(
     units: UnitsOption = "auto",
     camera: CameraOption = None,
     detector: DetectorOption = None,
-    weights: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="A trained detector; the same as --detector FILE.")
-    ] = None,
     least: Annotated[float | None, typer.Option(min=0, max=1, help="Least score.", rich_help_panel=SCORES)] = None,
     most: Annotated[int, typer.Option(min=1, help="Detections of a mesh at most (novel).", rich_help_panel=SCORES)] = 3,
     verify: Annotated[
@@ -76,18 +74,16 @@ def detect(
 
     if verify and not model:
         raise ConfigError("--verify looks for poses of meshes: pass --model MESH, or leave it out.")
-    if weights is not None and detector is not None:
-        raise ConfigError("--weights and --detector were both given, and mean the same: pass one of them.")
     folder = OutputFolder(out or Path("posekit-out") / f"{image.stem}-detections", force)
+    use_threads(threads)
     view = load_view(image, camera)
     meshes = [ObjectModel.load(path, units=units) for path in model or ()]
     finder, classes = make_detector(
-        str(weights) if weights is not None else detector,
+        detector,
         meshes,
         least=None if verify else least,
         most=most,
         doubtful=bool(verify),
-        threads=threads,
     )
     verify = isinstance(finder, NovelDetector) and bool(meshes) if verify is None else verify
     if verify and isinstance(finder, NovelDetector):  # the poses are asked for the least score, not the looks
@@ -95,7 +91,7 @@ def detect(
     started = time.perf_counter()
     found = sorted(finder.detect(view, meshes), key=lambda d: -d.score)
     if verify:
-        found = _verified(view, found, meshes, SearchOptions().least if least is None else least, threads)
+        found = _verified(view, found, meshes, SearchOptions().least if least is None else least)
     seconds = time.perf_counter() - started
     for detection in found:
         typer.echo(
@@ -111,18 +107,11 @@ def detect(
     typer.echo(f"BOP: {folder.write('bop.json', to_bop(found, classes, image, seconds, scene))}")
 
 
-def _verified(
-    view: View, found: Sequence[Detection], meshes: Sequence[ObjectModel], least: float, threads: int | None
-) -> list[Detection]:
+def _verified(view: View, found: Sequence[Detection], meshes: Sequence[ObjectModel], least: float) -> list[Detection]:
     """What a pose speaks for, best first, scored by it."""
-    from posekit.estimate import PoseEstimator
-    from posekit.search import SearchOptions, estimates_of, judged
+    from posekit.estimate import Estimators
+    from posekit.search import SearchOptions, find_instances, judged
 
-    kept = []
-    for mesh in meshes:
-        mine = [d for d in found if d.label == mesh.name]
-        estimates = (
-            estimates_of(PoseEstimator(mesh, threads=threads), view, mine, SearchOptions(least=least)) if mine else []
-        )
-        kept += [d for d in judged(mine, estimates) if d.score >= least]
+    results = find_instances(Estimators(), view, meshes, found, SearchOptions(least=least))
+    kept = [d for each in results for d in judged(each) if d.score >= least]
     return sorted(kept, key=lambda d: -d.score)

@@ -25,7 +25,6 @@ from posekit.cli.options import (
     OutlineOption,
     OutOption,
     PresetOption,
-    SeedOption,
     StopAngleOption,
     StopOption,
     SymmetryOption,
@@ -33,6 +32,7 @@ from posekit.cli.options import (
     UnitsOption,
     UpdateOption,
     WeightsOption,
+    use_threads,
 )
 
 CANDIDATES = 3  # detections of a mesh that are estimated at least, of which the best estimate is kept
@@ -72,13 +72,12 @@ def estimate(
     weights: WeightsOption = None,
     init: InitOption = "templates",
     hypotheses: HypothesesOption = 5,
-    update: UpdateOption = "correspondence",
+    update: UpdateOption = "auto",
     stop: StopOption = "angle",
     iterations: IterationsOption = 50,
     stop_angle: StopAngleOption = 2.0,
     contour: ContourOption = True,
     outline: OutlineOption = True,
-    seed: SeedOption = 0,
     threads: ThreadsOption = None,
     out: OutOption = None,
     force: ForceOption = False,
@@ -90,14 +89,13 @@ def estimate(
     destination = Destination.chosen(out, Path("posekit-out") / image.stem, force, json)
 
     from posekit.cli.prompts import prompt_for
-    from posekit.estimate import EstimateOptions, PoseEstimator
+    from posekit.estimate import EstimateOptions, Estimators
     from posekit.load import load_view
     from posekit.object_model import ObjectModel
-    from posekit.search import SearchOptions, estimate_instances
+    from posekit.search import SearchOptions, find_instances
 
-    options = EstimateOptions(
-        init, hypotheses, update, stop, iterations, stop_angle, seed, contour=contour, outline=outline
-    )
+    use_threads(threads)
+    options = EstimateOptions(init, hypotheses, update, stop, iterations, stop_angle, contour=contour, outline=outline)
     view = load_view(image, camera)
     meshes = [ObjectModel.load(path, units=units, symmetry=symmetry) for path in model]
     finder = prompt_for(box, mask, mask_from, detections, image, view.lens)
@@ -107,23 +105,15 @@ def estimate(
 
         with destination.working("loading the detector"):
             candidates = max(CANDIDATES, instances + 1)
-            finder, _ = make_detector(detector, meshes, most=candidates, doubtful=True, threads=threads)
+            finder, _ = make_detector(detector, meshes, most=candidates, doubtful=True)
     with destination.working("detecting"):
         found = finder.detect(view, meshes)
     with destination.working("loading the networks"):
-        estimators = [
-            PoseEstimator(mesh, preset=preset, weights=weights, options=options, threads=threads) for mesh in meshes
-        ]
-    search = SearchOptions() if not asked else SearchOptions.given(box is not None or mask is not None)
+        estimators = Estimators(preset=preset, weights=weights, options=options)
+    search = SearchOptions.usual(found)
     search = replace(search, instances=search.instances if asked else instances,
                      least=search.least if least is None else least)  # fmt: skip
     with destination.working("estimating"):
-        results = [
-            (
-                estimator,
-                estimate_instances(estimator, view, [d for d in found if d.label == estimator.model.name], search),
-            )
-            for estimator in estimators
-        ]
+        results = find_instances(estimators, view, meshes, found, search)
     paths = [{"image": image, "mesh": path} for path in model]
-    destination.deliver_all(view, results, paths)
+    destination.deliver_all(view, [(estimators(each.model), each.instances) for each in results], paths)

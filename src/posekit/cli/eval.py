@@ -18,7 +18,6 @@ from posekit.cli.options import (
     IterationsOption,
     OutlineOption,
     PresetOption,
-    SeedOption,
     StopAngleOption,
     StopOption,
     UpdateOption,
@@ -84,14 +83,17 @@ def evaluate(
     weights: WeightsOption = None,
     init: InitOption = "templates",
     hypotheses: HypothesesOption = 5,
-    update: UpdateOption = "correspondence",
+    update: UpdateOption = "auto",
     stop: StopOption = "angle",
     iterations: IterationsOption = 50,
     stop_angle: StopAngleOption = 2.0,
     beside: BesideOption = True,
     contour: ContourOption = True,
     outline: OutlineOption = True,
-    seed: SeedOption = 0,
+    seed: Annotated[
+        int,
+        typer.Option(help="Of the refine stage's disturbances, and of --compare's bootstrap.", rich_help_panel=STAGE),
+    ] = 0,
     threads: Annotated[int, typer.Option(min=1, help="Of torch, in each worker.", rich_help_panel=LOOP)] = 1,
     workers: Annotated[int, typer.Option(min=1, help="Processes.", rich_help_panel=LOOP)] = 1,
     out: Annotated[
@@ -135,11 +137,10 @@ def evaluate(
         detector=detector,
         masks=masks,
         noise=_noise(noise),
+        seed=seed,
         preset=preset,
         weights=weights,
-        estimate=EstimateOptions(
-            init, hypotheses, update, stop, iterations, stop_angle, seed, beside, contour, outline
-        ),
+        estimate=EstimateOptions(init, hypotheses, update, stop, iterations, stop_angle, beside, contour, outline),
         threads=threads,
         workers=workers,
     )

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 Units = Literal["auto", "mm", "cm", "m", "in"]
-Update = Literal["correspondence", "regression"]
+Update = Literal["auto", "correspondence", "regression"]
 Stop = Literal["angle", "fixed"]
 MaskFrom = Literal["none", "grabcut", "filled"]
 
@@ -72,7 +72,10 @@ WeightsOption = Annotated[
     Path | None,
     typer.Option(metavar="FILE", help="Weights in place of the shipped ones.", rich_help_panel=LOOP),
 ]
-UpdateOption = Annotated[Update, typer.Option(help="What moves the pose.", rich_help_panel=LOOP)]
+UpdateOption = Annotated[
+    Update,
+    typer.Option(help="What moves the pose; auto: correspondences where the network gives them.", rich_help_panel=LOOP),
+]
 StopOption = Annotated[
     Stop,
     typer.Option(help="At a predicted angle (the paper), or after a fixed number (DeepIM).", rich_help_panel=LOOP),
@@ -105,10 +108,18 @@ OutlineOption = Annotated[
         rich_help_panel=LOOP,
     ),
 ]
-SeedOption = Annotated[int, typer.Option(help="The same seed gives the same result.", rich_help_panel=LOOP)]
 ThreadsOption = Annotated[
     int | None, typer.Option(min=1, help="Threads of torch; by default its own choice.", rich_help_panel=LOOP)
 ]
+
+
+def use_threads(count: int | None) -> None:
+    """Let torch use so many threads from now on in this process; its own choice where none is given."""
+    if count is not None:
+        import torch
+
+        torch.set_num_threads(count)
+
 
 OutOption = Annotated[
     Path | None,

@@ -23,7 +23,6 @@ from posekit.cli.options import (
     OutlineOption,
     OutOption,
     PresetOption,
-    SeedOption,
     StopAngleOption,
     StopOption,
     SymmetryOption,
@@ -31,6 +30,7 @@ from posekit.cli.options import (
     UnitsOption,
     UpdateOption,
     WeightsOption,
+    use_threads,
 )
 
 PoseOption = Annotated[
@@ -51,14 +51,13 @@ def refine(
     symmetry: SymmetryOption = None,
     preset: PresetOption = "lite",
     weights: WeightsOption = None,
-    update: UpdateOption = "correspondence",
+    update: UpdateOption = "auto",
     stop: StopOption = "angle",
     iterations: IterationsOption = 50,
     stop_angle: StopAngleOption = 2.0,
     beside: BesideOption = True,
     contour: ContourOption = True,
     outline: OutlineOption = True,
-    seed: SeedOption = 0,
     threads: ThreadsOption = None,
     out: OutOption = None,
     force: ForceOption = False,
@@ -74,12 +73,12 @@ def refine(
     from posekit.load import load_pose, load_view
     from posekit.object_model import ObjectModel
 
+    use_threads(threads)
     options = EstimateOptions(
         update=update,
         stop=stop,
         iterations=iterations,
         stop_angle_deg=stop_angle,
-        seed=seed,
         beside=beside,
         contour=contour,
         outline=outline,
@@ -91,7 +90,7 @@ def refine(
         [detection] = detector_for(box, mask, mask_from, view.lens).detect(view, [mesh])
         view = view.with_mask(detection.mask)
     with destination.working("loading the networks"):
-        estimator = PoseEstimator(mesh, preset=preset, weights=weights, options=options, threads=threads)
+        estimator = PoseEstimator(mesh, preset=preset, weights=weights, options=options)
     with destination.working("refining"):
         refined = estimator.refine(view, start)
     destination.deliver(estimator, view, [refined], {"image": image, "mesh": model})

@@ -26,6 +26,7 @@ from posekit.cli.options import (
     ThreadsOption,
     UnitsOption,
     WeightsOption,
+    use_threads,
 )
 
 if TYPE_CHECKING:
@@ -100,7 +101,7 @@ def track(
     folder = OutputFolder(out or Path("posekit-out") / f"{Path(source).stem or 'camera'}-track", force)
 
     from posekit.errors import ImageError, PromptError
-    from posekit.estimate import EstimateOptions, PoseEstimator
+    from posekit.estimate import Estimators
     from posekit.load import load_pose
     from posekit.object_model import ObjectModel
     from posekit.track import TrackConfig, Tracker
@@ -108,6 +109,7 @@ def track(
 
     if pose and len(pose) != len(model):
         raise PromptError(f"{len(pose)} --pose for {len(model)} --model: give one for each, in their order, or none.")
+    use_threads(threads)
     config = TrackConfig(
         restart_angle,
         still_angle,
@@ -125,13 +127,12 @@ def track(
     if not pose or detector is not None:
         from posekit.novel import make_detector
 
-        finder, _ = make_detector(detector, meshes, threads=threads)
-    chosen = EstimateOptions(update="correspondence" if preset == "lite" else "regression")
+        finder, _ = make_detector(detector, meshes, doubtful=True)
+    estimators = Estimators(preset=preset, weights=weights)
     trackers = [
-        Tracker(mesh, pose=start, detector=finder, config=config,
-                estimator=PoseEstimator(mesh, preset=preset, weights=weights, options=chosen, threads=threads))
+        Tracker(mesh, pose=start, detector=finder, config=config, estimator=estimators(mesh))
         for mesh, start in zip(meshes, starts, strict=True)
-    ]  # fmt: skip
+    ]
     counts = _run(trackers, sequence, folder, overlay, rerun, frames)
     typer.echo(", ".join(f"{count} {state}" for state, count in counts.states.items()))
     if counts.problems:
@@ -207,7 +208,7 @@ def _step(trackers: Sequence[Tracker], frame: Frame, counts: _Counts) -> list[Tr
         results = [Tracked(LOST) for _ in trackers]
     else:
         counts.used += 1
-        results = [tracker.step(frame.image, frame.camera) for tracker in trackers]
+        results = [tracker.step(frame.image, frame.camera, frame.valid) for tracker in trackers]
     for result in results:
         counts.states[result.state] = counts.states.get(result.state, 0) + 1
     return results

@@ -16,7 +16,7 @@ from posekit.detect.prompts import clip_box
 from posekit.detect.segmentation import decode, encode, xywh
 from posekit.errors import PromptError
 from posekit.object_model import ObjectModel
-from posekit.results import Detection
+from posekit.results import Detection, Source
 from posekit.view import View
 
 log = logging.getLogger("posekit")
@@ -113,7 +113,7 @@ class DetectionsFile:
         if view.lens is not None:
             box = view.lens.undistorted_box(clip_box(box, taken))
             mask = None if mask is None else view.lens.undistorted_mask(mask)
-        return Detection(clip_box(box, view.camera), mask, score, model.name, "file")
+        return Detection(clip_box(box, view.camera), mask, score, model.name, Source.FILE)
 
 
 def _parts(data: Any) -> tuple[list[Any], dict[int, str], dict[int, str]]:

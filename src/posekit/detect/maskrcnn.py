@@ -24,10 +24,10 @@ from posekit.detect.vision import torchvision
 from posekit.errors import ConfigError, WeightsError
 from posekit.files import write_bytes_atomic, write_text_atomic
 from posekit.object_model import ObjectModel
-from posekit.results import Detection
+from posekit.results import Detection, Source
 from posekit.view import View
 
-KIND = SOURCE = "mask-rcnn"
+KIND = "mask-rcnn"
 NOVEL = ("object",)  # the one class of a class-agnostic detector
 SHIPPED = Path(__file__).resolve().parent.parent / "weights" / "detector-novel"
 Look = tuple[float, bool]  # at the picture: its size over the configuration's ``use_size``, and whether it is mirrored
@@ -313,7 +313,7 @@ class MaskRCNN:
             name = classes[label]
             if left.get(name, 0):
                 left[name] -= 1
-                detections.append(sharpened(view.image, Detection(_box(box), mask, float(score), name, SOURCE)))
+                detections.append(sharpened(view.image, Detection(_box(box), mask, float(score), name, Source.TRAINED)))
         return detections
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from posekit.camera import Box, Camera, mask_box
 from posekit.errors import PromptError
 from posekit.object_model import ObjectModel
-from posekit.results import Detection
+from posekit.results import Detection, Source
 from posekit.view import View
 
 Mask = NDArray[np.bool_]
@@ -59,7 +59,7 @@ class BoxPrompt:
         if self.mask_from == "none":
             return [Detection(box=box, label=model.name) for model in models]
         mask = grabcut_mask(view.image, box) if self.mask_from == "grabcut" else None
-        source = "box+filled" if mask is None else "box+grabcut"
+        source = Source.FILLED if mask is None else Source.GRABCUT
         mask = filled_mask(box, view.camera) if mask is None else mask
         return [Detection(box=box, mask=mask, label=model.name, source=source) for model in models]
 
@@ -81,7 +81,7 @@ class MaskPrompt:
         box = mask_box(self.mask)
         if box is None:
             raise PromptError("the mask is empty: its pixels must be brighter than 0 where the object is.")
-        return [Detection(box=box, mask=self.mask, label=model.name, source="mask") for model in models]
+        return [Detection(box=box, mask=self.mask, label=model.name, source=Source.MASK) for model in models]
 
 
 def clip_box(box: Box, camera: Camera) -> Box:

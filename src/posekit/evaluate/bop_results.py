@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from posekit.camera import Box
 from posekit.detect.segmentation import decode
 from posekit.errors import InputError
-from posekit.geometry import Pose
 
 COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 _LOOSE = 0.01  # how far R R^T may be from the identity: files are rounded
@@ -299,8 +298,3 @@ def _text(path: Path) -> str:
 def _some(values: Collection[int]) -> str:
     listed = sorted(values)
     return ", ".join(map(str, listed[:12])) + (" ..." if len(listed) > 12 else "")
-
-
-def pose_of(row: ResultRow) -> Pose:
-    """T_cam_obj as the file has it, unrounded."""
-    return Pose(row.R, row.t)

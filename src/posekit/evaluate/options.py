@@ -24,7 +24,8 @@ class EvalOptions:
     all where empty. limit: that many pictures, spread evenly. min_visible: instances at least as visible, in [0, 1];
     None is the test's own targets. detections: one of GIVEN, DETECTOR or a JSON file. detector: which one, a name or
     file of weights, as `novel.make_detector` takes it. masks: whether the refiner is given
-    the visible mask. noise: degrees and three cm, standard deviations. threads: of torch, in each worker; the same
+    the visible mask. noise: degrees and three cm, standard deviations;
+    seed: of the disturbances. threads: of torch, in each worker; the same
     whatever the number of workers, since sums depend on it. The rest is EstimateOptions'."""
 
     stage: str
@@ -39,6 +40,7 @@ class EvalOptions:
     detector: str = "novel"
     masks: str = "true"
     noise: tuple[float, float, float, float] = (15.0, 1.0, 1.0, 5.0)
+    seed: int = 0
     preset: str = "lite"
     weights: Path | None = None
     estimate: EstimateOptions = EstimateOptions()

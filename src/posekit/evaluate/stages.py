@@ -20,7 +20,7 @@ from posekit.detect import BoxPrompt, Detector
 from posekit.detect.prompts import clip_box
 from posekit.detect.segmentation import encode
 from posekit.errors import ConfigError, PromptError
-from posekit.estimate import PoseEstimator
+from posekit.estimate import Estimators, PoseEstimator
 from posekit.evaluate.bop_results import FoundRegion, read_detections
 from posekit.evaluate.options import DETECTOR, GIVEN, EvalOptions
 from posekit.evaluate.tracking import Sequences
@@ -28,8 +28,9 @@ from posekit.evaluate.truths import Truth, TruthReader, selected
 from posekit.geometry import Pose
 from posekit.metrics import box_iou
 from posekit.novel import make_detector
-from posekit.results import Detection, Estimate
-from posekit.search import SearchOptions, estimates_of, instances_of, judged
+from posekit.object_model import ObjectModel
+from posekit.results import Detection, Estimate, Source
+from posekit.search import SearchOptions, find_instances, judged
 from posekit.view import View
 
 Record = dict[str, Any]
@@ -43,7 +44,7 @@ class ImageStage:
         self.options = options
         self.data, self.info = open_dataset(options.dataset, options.root, options.split)
         self.truths = TruthReader(self.data)
-        self._estimators: dict[int, PoseEstimator] = {}
+        self._estimators: Estimators | None = None
         self._sequences = Sequences(self._estimator, "openvino" if options.preset == "lite" else "torch")
         self._files: Mapping[tuple[int, int], Sequence[FoundRegion]] = {}
         self._detector: Detector | None = None
@@ -98,31 +99,36 @@ class ImageStage:
         estimator, mask = self._estimator(truth.instance.obj_id), truth.read_mask()
         if self.options.detections == "gt-masks":
             box = mask_box(mask)
-            detections = [] if box is None else [Detection(box, mask, 1.0, estimator.model.name, "mask")]
+            detections = [] if box is None else [Detection(box, mask, 1.0, estimator.model.name, Source.MASK)]
         else:
             detections = _prompted(view, truth.box_visib, estimator)
-        found = estimator.estimate(view, detections)
-        return _entry(found[0], truth.instance.obj_id, truth.instance.index) if found else None
+        [found] = find_instances(self._estimators_of, view, [estimator.model], detections)
+        return _entry(found.instances[0], truth.instance.obj_id, truth.instance.index) if found.instances else None
 
     def _from_file(self, view: View, regions: Sequence[FoundRegion]) -> list[Record]:
+        """Of every object that the file has in this picture, as `posekit estimate --detections` finds them."""
+        numbers = [k for k in dict.fromkeys(r.obj_id for r in regions) if k in (self.options.objects or (k,))]
         entries = []
-        for region in regions:
-            if self.options.objects and region.obj_id not in self.options.objects:
-                continue
-            estimator, mask = self._estimator(region.obj_id), region.mask()
-            if mask is not None and mask.shape != view.image.shape[:2]:
-                raise ConfigError(
-                    f"{self.options.detections}: a mask of scene {region.scene}, image {region.image} is "
-                    f"{mask.shape[1]}x{mask.shape[0]}, the picture {view.camera.width}x{view.camera.height}."
-                )
-            if mask is not None:
-                detections = [Detection(region.box, mask, region.score, estimator.model.name, "file")]
-            else:
-                detections = _prompted(view, region.box, estimator)
-            for estimate in estimator.estimate(view, detections):
-                entry = _entry(estimate, region.obj_id, None)
-                entries.append(entry | {"score": region.score * estimate.score, "detection_score": region.score})
+        for obj_id in numbers:
+            model = self.data.model(obj_id)
+            detections = [d for r in regions if r.obj_id == obj_id for d in self._told(view, r, model.name)]
+            [found] = find_instances(self._estimators_of, view, [model], detections)
+            entries += [_entry(e, obj_id, None) | {"detection_score": _detection_score(e)} for e in found.instances]
         return entries
+
+    def _told(self, view: View, region: FoundRegion, name: str) -> list[Detection]:
+        """A file's region as a detection; none where its box lies outside the picture. Raises ConfigError."""
+        mask = region.mask()
+        if mask is not None and mask.shape != view.image.shape[:2]:
+            raise ConfigError(
+                f"{self.options.detections}: a mask of scene {region.scene}, image {region.image} is "
+                f"{mask.shape[1]}x{mask.shape[0]}, the picture {view.camera.width}x{view.camera.height}."
+            )
+        try:
+            box = clip_box(region.box, view.camera)
+        except PromptError:
+            return []
+        return [Detection(box, mask if mask is not None and mask.any() else None, region.score, name, Source.FILE)]
 
     def _detected(self, view: View, scene: int, image: int) -> tuple[list[Record], list[FoundRegion]]:
         """Estimates from what the detector finds of the data set's objects, and the detections. As `posekit estimate`
@@ -131,36 +137,36 @@ class ImageStage:
         numbers = self.options.objects or tuple(self.data.model_ids())
         models = {obj_id: self.data.model(obj_id) for obj_id in numbers}
         if self._detector is None:
-            self._detector, _ = make_detector(
-                self.options.detector, list(models.values()), doubtful=True, threads=self.options.threads
-            )
+            self._detector, _ = make_detector(self.options.detector, list(models.values()), doubtful=True)
         started = time.perf_counter()
         found = self._detector.detect(view, list(models.values()))
         seconds = time.perf_counter() - started
         entries, regions = [], []
-        for obj_id, model in models.items():
-            mine = [d for d in found if d.label == model.name]
-            options = SearchOptions(instances=0)
-            estimates = estimates_of(self._estimator(obj_id), view, mine, options)
-            regions += [_region(d, scene, image, obj_id, seconds) for d in judged(mine, estimates)]
-            for estimate in instances_of(estimates, options):
-                assert estimate.detection is not None
-                entries.append(_entry(estimate, obj_id, None) | {"detection_score": estimate.detection.score})
+        results = find_instances(self._estimators_of, view, list(models.values()), found, SearchOptions(instances=0))
+        for obj_id, each in zip(models, results, strict=True):
+            regions += [_region(d, scene, image, obj_id, seconds) for d in judged(each)]
+            entries += [_entry(e, obj_id, None) | {"detection_score": _detection_score(e)} for e in each.instances]
         return entries, regions
 
-    def _estimator(self, obj_id: int) -> PoseEstimator:
-        if obj_id not in self._estimators:
+    def _estimators_of(self, model: ObjectModel) -> PoseEstimator:
+        if self._estimators is None:
             o = self.options
-            self._estimators[obj_id] = PoseEstimator(
-                self.data.model(obj_id), preset=o.preset, weights=o.weights, options=o.estimate, threads=o.threads
-            )
-        return self._estimators[obj_id]
+            self._estimators = Estimators(preset=o.preset, weights=o.weights, options=o.estimate)
+        return self._estimators(model)
+
+    def _estimator(self, obj_id: int) -> PoseEstimator:
+        return self._estimators_of(self.data.model(obj_id))
+
+
+def _detection_score(estimate: Estimate) -> float:
+    assert estimate.detection is not None
+    return estimate.detection.score
 
 
 def disturbed(truth: Truth, estimator: PoseEstimator, options: EvalOptions) -> Pose:
     """The truth disturbed about the object's centre, by random numbers of this instance alone."""
     i, model = truth.instance, estimator.model
-    rng = np.random.default_rng([options.estimate.seed, i.scene, i.image, i.index])
+    rng = np.random.default_rng([options.seed, i.scene, i.image, i.index])
     return options.pose_noise.disturb(i.T_cam_obj @ model.T_obj_ctr, rng) @ model.T_obj_ctr.inverse()
 
 

@@ -9,7 +9,7 @@ from posekit.camera import mask_box
 from posekit.estimate import PoseEstimator
 from posekit.evaluate.truths import Truth
 from posekit.object_model import ObjectModel
-from posekit.results import Detection
+from posekit.results import Detection, Source
 from posekit.track import TrackConfig, Tracked, Tracker
 from posekit.view import View
 
@@ -25,7 +25,7 @@ class TrueMask:
         mask = self.truth.read_mask()
         box = mask_box(mask)
         known = box is not None and mask.shape == view.image.shape[:2]
-        return [Detection(box, mask, 1.0, models[0].name, "mask")] if box is not None and known else []
+        return [Detection(box, mask, 1.0, models[0].name, Source.MASK)] if box is not None and known else []
 
 
 class Sequences:
@@ -55,5 +55,5 @@ class Sequences:
     def _one(self, obj_id: int, view: View, truths: Sequence[Truth]) -> tuple[Tracked, int, int | None]:
         tracker, mask = self.trackers[obj_id]
         mask.truth = next((t for t in truths if t.instance.obj_id == obj_id), None)
-        found = tracker.step(view.image, view.camera)
+        found = tracker.step(view.image, view.camera, view.valid)
         return found, obj_id, None if mask.truth is None else mask.truth.instance.index

@@ -9,7 +9,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
 from typing import TYPE_CHECKING, Any, cast
 
@@ -30,9 +30,10 @@ def run_pictures(options: EvalOptions, pictures: Sequence[Picture]) -> Iterator[
     """
     count = min(options.workers, len(pictures))
     if count <= 1:
-        stage = ImageStage(options)
-        for picture in pictures:
-            yield picture, run_once(stage, *picture)
+        with _threads(options.threads):
+            stage = ImageStage(options)
+            for picture in pictures:
+                yield picture, run_once(stage, *picture)
         return
     pool = _Pool(options, count)
     try:
@@ -91,11 +92,24 @@ class _Pool:
             process.join()
 
 
+@contextmanager
+def _threads(count: int) -> Iterator[None]:
+    """Torch with so many threads, in this process; afterwards with as many as before."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
 def _work(pipe: Connection, options: EvalOptions) -> None:
     """A worker's life."""
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     stage: ImageStage | None = None
-    with suppress(EOFError, BrokenPipeError, KeyboardInterrupt):
+    with suppress(EOFError, BrokenPipeError, KeyboardInterrupt), _threads(options.threads):
         while True:
             picture = pipe.recv()
             try:

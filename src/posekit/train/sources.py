@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,11 +14,11 @@ from numpy.typing import NDArray
 from posekit.data.bop import BopDataset
 from posekit.data.stream import load_photos
 from posekit.errors import ConfigError, MeshError
-from posekit.object_model import ObjectModel
+from posekit.object_model import FORMATS, ObjectModel
 from posekit.train.config import SourceConfig
 
 TEXTURE = 512  # pixels: longer sides are shrunk, since a crop shows fewer
-MESHES = (".ply", ".obj", ".glb", ".gltf", ".stl", ".off")
+log = logging.getLogger("posekit")
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,10 +76,22 @@ def read_sources(config: SourceConfig) -> Sources:
 def _meshes(folder: Path, units: str) -> list[ObjectModel]:
     if not folder.is_dir():
         raise MeshError(f"there is no folder of meshes {folder}.")
-    paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in MESHES)
+    paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in FORMATS)
     if not paths:
-        raise MeshError(f"the folder {folder} holds no meshes ({', '.join(MESHES)}).")
-    return [_light(ObjectModel.load(path, units=units)) for path in paths]
+        raise MeshError(f"the folder {folder} holds no meshes ({', '.join(FORMATS)}).")
+    models = [model for path in paths if (model := _loaded(path, units)) is not None]
+    if not models:
+        raise MeshError(f"none of the {len(paths)} meshes in {folder} can be used; the notes above say why.")
+    return models
+
+
+def _loaded(path: Path, units: str) -> ObjectModel | None:
+    """A mesh of a folder; None where it cannot be used, which is told: it shall not end a training on a thousand."""
+    try:
+        return _light(ObjectModel.load(path, units=units))
+    except MeshError as error:
+        log.warning("a mesh is left out: %s", error)
+        return None
 
 
 def _light(model: ObjectModel) -> ObjectModel:

@@ -1,0 +1,149 @@
+"""The equations of evidence against finite differences: fusion's, the contour's and the rigid solve's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from conftest import differences, moved
+from posekit.camera import Camera
+from posekit.contour import ContourConfig, _equations, _Look
+from posekit.fusion import Belief, Lines, Points, fuse
+from posekit.geometry import Pose, so3_exp, so3_log
+from posekit.nets.rigid import Motion, Surface, _step, exp_so3, induced_flow
+
+CAMERA = Camera(640.0, 655.0, 80.5, 58.5, 160, 120)
+POSE = Pose(so3_exp([0.3, -0.5, 0.9]), np.array([0.02, -0.01, 0.6]))
+RNG = np.random.default_rng(3)
+POINTS = RNG.uniform(-0.05, 0.05, (30, 3))
+PIXELS = CAMERA.project(POSE.apply(POINTS)) + RNG.normal(size=(30, 2)) * 2.0
+SIGMA = RNG.uniform(0.5, 2.0, 30)
+WEIGHT = RNG.uniform(0.2, 1.0, 30)
+NORMALS = np.stack([np.cos(a := RNG.uniform(0, 6.28, 30)), np.sin(a)], axis=1)
+FIRM = 1e9  # a knee beyond which nothing lies: then the equations are those of plain least squares
+
+
+def about(residual, pose: Pose, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[no-untyped-def]
+    """Normal matrix and right side of weighted least squares, by finite differences. residual: of a pose, (N,)."""
+    J = differences(lambda step: residual(moved(pose, step)), 6)
+    return J.T @ (J * weight[:, None]), -J.T @ (residual(pose) * weight)
+
+
+@pytest.mark.parametrize("together", [1.0, 4.0])
+def test_points_equations_are_weighted_least_squares(together: float) -> None:
+    term = Points(POINTS, PIXELS, WEIGHT, SIGMA, FIRM, together)
+    weight = np.repeat(WEIGHT / SIGMA**2 / together, 2)
+    wanted = about(lambda pose: (CAMERA.project(pose.apply(POINTS)) - PIXELS).ravel(), POSE, weight)
+    for found, expected in zip(term.equations(POSE, CAMERA), wanted, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-3 * np.abs(expected).max())
+
+
+def test_lines_equations_are_weighted_least_squares() -> None:
+    term = Lines(POINTS, PIXELS, NORMALS, SIGMA, FIRM, 4.0)
+    wanted = about(
+        lambda pose: ((CAMERA.project(pose.apply(POINTS)) - PIXELS) * NORMALS).sum(axis=1), POSE, 1 / SIGMA**2 / 4
+    )
+    for found, expected in zip(term.equations(POSE, CAMERA), wanted, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-3 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_robust_weights_depend_on_the_size_alone(sign: float) -> None:
+    """A quarter of the weight at the knee, which is three standard deviations or 1.5 medians."""
+    exact = CAMERA.project(POSE.apply(POINTS))
+    far = exact.copy()
+    far[0] -= sign * 6.0 * NORMALS[0]
+    one, none = Lines(POINTS, far, NORMALS, np.full(30, 2.0)), Lines(POINTS, exact, NORMALS, np.full(30, 2.0))
+    J = differences(
+        lambda step: ((CAMERA.project(moved(POSE, step).apply(POINTS[:1])) - far[:1]) * NORMALS[:1]).sum(1), 6
+    )
+    lost = none.equations(POSE, CAMERA)[0] - one.equations(POSE, CAMERA)[0]
+    np.testing.assert_allclose(lost, 0.75 * J.T @ J / 4.0 / 4.0, rtol=1e-4, atol=1e-3 * np.abs(lost).max())
+    np.testing.assert_allclose(one.equations(POSE, CAMERA)[1], -J[0] * sign * 6.0 * 0.25 / 16.0, rtol=1e-4, atol=1e-3)
+
+
+def test_a_belief_pulls_towards_its_pose_and_turns_with_its_axes() -> None:
+    step = np.array([0.02, -0.01, 0.03, 0.002, 0.003, -0.004])
+    belief = Belief.about(moved(POSE, step), CAMERA, 0.1, 5.0, 0.02)
+    np.testing.assert_allclose(np.diag(belief.covariance)[[0, 3, 5]],
+                               [0.01, (5 / 640 * belief.pose.t[2]) ** 2, (0.02 * belief.pose.t[2]) ** 2])  # fmt: skip
+    assert belief.turn_std == pytest.approx(0.1 * np.sqrt(3))
+    normal, right = belief.equations(POSE, CAMERA)
+    np.testing.assert_allclose(np.linalg.solve(normal, right), step, atol=1e-9)
+    R = so3_exp([0.4, 0.1, -0.2])
+    turned = belief.turned(R)
+    found = fuse(Pose.rotation(R) @ POSE, [turned], CAMERA)
+    assert found is not None
+    np.testing.assert_allclose(found.pose.matrix, (Pose.rotation(R) @ belief.pose).matrix, atol=1e-6)
+    np.testing.assert_allclose(turned.covariance[3:, 3:], R @ belief.covariance[3:, 3:] @ R.T)
+    np.testing.assert_allclose(belief.spread(np.eye(6)).covariance, belief.covariance + np.eye(6))
+
+
+def test_fusing_leaves_no_point_behind_the_camera() -> None:
+    near = Belief.about(Pose(POSE.R, np.array([0.0, 0.0, 5e-4])), CAMERA, 0.1, 1.0, 0.1)
+    assert fuse(POSE, [near], CAMERA) is None
+
+
+def test_the_contours_equations_are_least_squares_with_a_prior() -> None:
+    """The mask's distance is linear in the picture here, so that its change with the pose is known."""
+    config = ContourConfig(knee=FIRM)
+    start = moved(POSE, np.array([0.01, 0.02, -0.01, 0.001, 0.0, 0.002]))
+    place = CAMERA.project(POSE.apply(POINTS))
+    distance = RNG.normal(size=30)
+    look = _Look(CAMERA, np.eye(3), Pose.identity(), POSE, POINTS, distance, NORMALS, np.ones(30, bool), 1.5)
+    grown = 0.7
+
+    def residual(step: np.ndarray) -> np.ndarray:
+        moves = ((CAMERA.project(moved(POSE, step).apply(POINTS)) - place) * NORMALS).sum(axis=1)
+        return np.asarray(distance + moves - grown - step[6])
+
+    J = differences(residual, 7)
+    weight = 1 / config.sigma**2 / (config.together * 1.5)
+    depth = POSE.t[2]
+    sideways = config.shift / CAMERA.fx * depth
+    prior = np.array([config.turn] * 3 + [sideways] * 2 + [config.depth * depth, config.grown]) ** -2.0
+    back = np.concatenate([so3_log(start.R @ POSE.R.T), start.t - POSE.t, [-grown]])
+    normal, right = _equations(look, start, grown, config)
+    expected = weight * J.T @ J + np.diag(prior)
+    np.testing.assert_allclose(normal, expected, rtol=1e-5, atol=1e-4 * np.abs(expected).max())
+    np.testing.assert_allclose(right, prior * back - weight * J.T @ residual(np.zeros(7)), rtol=1e-4, atol=1e-2)
+    hidden = replace(look, clear=np.arange(30) < 15)
+    assert np.trace(_equations(hidden, start, grown, config)[0]) < np.trace(normal)
+
+
+# --- the solve inside the network ------------------------------------------------------------------------------------
+
+
+def surface() -> Surface:
+    relief = 0.1 * torch.rand(1, 6, 8, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return Surface.of(relief, torch.tensor([4.0], dtype=torch.float64), 4, 2.0)
+
+
+def test_rotation_vectors_become_rotations() -> None:
+    w = torch.tensor([[0.3, -0.2, 0.9], [1e-5, 0.0, 0.0]], dtype=torch.float64)
+    for vector, R in zip(w.numpy(), exp_so3(w).numpy(), strict=True):
+        np.testing.assert_allclose(R, so3_exp(vector), atol=1e-9)
+
+
+def test_one_rigid_step_solves_the_damped_equations() -> None:
+    """Against central differences of the flow that a motion induces."""
+    there, rng = surface(), np.random.default_rng(5)
+    flow = torch.from_numpy(rng.normal(size=(1, 48, 2)))
+    weight = torch.from_numpy(rng.uniform(0.1, 1, (1, 48)))
+    start = Motion(torch.from_numpy(so3_exp([0.05, 0.02, -0.03])[None]), torch.tensor([[0.01, -0.02, 0.03]]).double())
+
+    def induced(step: np.ndarray) -> np.ndarray:
+        R = torch.from_numpy(so3_exp(step[:3])[None]) @ start.R
+        return induced_flow(there, Motion(R, start.t + torch.from_numpy(step[None, 3:]))).numpy().ravel()
+
+    J, share = differences(induced, 6), np.repeat((weight / weight.sum()).numpy().ravel(), 2)
+    A = J.T @ (J * share[:, None])
+    g = J.T @ (share * (flow.numpy().ravel() - induced(np.zeros(6))))
+    wanted = np.linalg.solve(A + np.eye(6) * (1e-2 * A + 1e-6), g)
+    found = _step(there, start, flow, weight)
+    np.testing.assert_allclose((found.t - start.t).numpy()[0], wanted[3:], rtol=1e-4, atol=1e-7)
+    turn = so3_log(found.R.numpy()[0] @ start.R.numpy()[0].T)
+    np.testing.assert_allclose(turn, wanted[:3], rtol=1e-4, atol=1e-7)
