@@ -12,7 +12,7 @@ import torch
 from typer.testing import CliRunner
 
 from objects import bracket
-from posekit.camera import Camera, mask_box
+from posekit.camera import Camera, box_overlap, mask_box
 from posekit.cli.app import app
 from posekit.data.tabletop import TabletopConfig, procedural_objects
 from posekit.data.tabletop_stream import TabletopStream, TabletopStreamConfig, labelled_scenes
@@ -39,7 +39,7 @@ from posekit.novel import LikenedDetector, NovelDetector
 from posekit.object_model import ObjectModel
 from posekit.render import Renderer
 from posekit.results import Detection, Estimate
-from posekit.search import SearchOptions, box_overlap, estimate_instances, estimates_of, judged
+from posekit.search import SearchOptions, estimate_instances, estimates_of, judged
 from posekit.train.config import MachineConfig, OptimiserConfig, SourceConfig, write_config
 from posekit.train.detector import DetectorConfig, DetectorModule, read_config, target, train_detector
 from posekit.view import View

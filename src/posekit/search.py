@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from posekit.camera import Box
+from posekit.camera import box_overlap
 from posekit.errors import ConfigError
 from posekit.estimate import PoseEstimator
+from posekit.features import SOURCE as FEATURES
 from posekit.novel import ANY, USUAL, WEIGHT, shifted
 from posekit.results import Detection, Estimate
 from posekit.view import View
@@ -67,15 +68,7 @@ def judged(detections: Sequence[Detection], estimates: Sequence[Estimate]) -> li
     detector that was trained for the object has its say: its own score is a factor."""
     scores = {id(each.detection): each.score for each in estimates}
     found = [
-        replace(each, score=scores.get(id(each), 0.0) * (1.0 if each.source == ANY else each.score))
+        replace(each, score=scores.get(id(each), 0.0) * (1.0 if each.source in (ANY, FEATURES) else each.score))
         for each in detections
     ]
     return sorted(found, key=lambda d: -d.score)
-
-
-def box_overlap(a: Box, b: Box) -> float:
-    """Intersection over union of two boxes (edges)."""
-    width = min(a[2], b[2]) - max(a[0], b[0])
-    height = min(a[3], b[3]) - max(a[1], b[1])
-    both = max(width, 0.0) * max(height, 0.0)
-    return both / max((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - both, 1e-9)
