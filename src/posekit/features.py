@@ -93,7 +93,8 @@ class FeatureModel:
     def of(cls, model: ObjectModel, renderer: Renderer) -> FeatureModel:
         """From the user's cache, else from rendered views, which take some seconds and are then kept there."""
         if model.texture is None and model.colors is None:
-            return cls(np.zeros((0, 128), np.float32), *np.zeros((3, 0, 3)), True)
+            none = np.zeros((0, 3))
+            return cls(np.zeros((0, 128), np.float32), none, none, none, True)
         kept = cache_file(model)
         with suppress(OSError, ValueError, KeyError, zipfile.BadZipFile):  # not there yet, or damaged: made anew
             return _read(kept)
@@ -152,7 +153,7 @@ class FeatureSearch:
 
     def _error(self, camera: Camera, box: Box | None) -> float:
         """Of a match, pixels at most."""
-        options, longer = self.options, max(camera.size)
+        options, longer = self.options, float(max(camera.size))
         if box is not None:
             longer = 2.0 * max(box[2] - box[0], box[3] - box[1])
         return max(options.error_px, options.error * longer)
@@ -314,7 +315,7 @@ def keypoints_of(view: View, box: Box | None = None) -> Keypoints:
     if box is not None:
         return _keypoints(view, box)
     if view not in _PICTURES:
-        _PICTURES[view] = _keypoints(view, (0.0, 0.0, *map(float, view.camera.size)))
+        _PICTURES[view] = _keypoints(view, (0.0, 0.0, float(view.camera.width), float(view.camera.height)))
     return _PICTURES[view]
 
 
@@ -426,7 +427,7 @@ def _keep(path: Path, made: _Made) -> None:
 def _read(path: Path) -> FeatureModel:
     """Raises OSError, ValueError, KeyError or BadZipFile where there is none that can be used."""
     with np.load(path, allow_pickle=False) as kept:
-        made = _decoded(*(kept[name] for name in ("raw", "points", "tips", "directions")), bool(kept["plain"]))
+        made = _decoded(kept["raw"], kept["points"], kept["tips"], kept["directions"], bool(kept["plain"]))
     n = len(made.points)
     if made.descriptors.shape != (n, 128) or {made.points.shape, made.tips.shape, made.directions.shape} != {(n, 3)}:
         raise ValueError(f"{path} holds other arrays than features")
