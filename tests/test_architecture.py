@@ -29,6 +29,7 @@ LAYERS = {
         "recording",
         "view_bank",
         "mvnet_search",
+        "features",
     },
     4: {"estimate", "novel"},
     5: {"search", "track", "evaluate", "train"},

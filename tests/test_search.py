@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from bop_scene import CAMERA, brick, put, write_scene
 from objects import bracket
-from posekit.camera import Camera
+from posekit.camera import Camera, box_overlap
 from posekit.cli.app import app
 from posekit.data.bop import BopDataset
 from posekit.detect.segmentation import encode, xywh
@@ -26,7 +26,7 @@ from posekit.geometry import Pose
 from posekit.nets.weights import build, save_networks
 from posekit.object_model import ObjectModel
 from posekit.results import Detection, Estimate, Source
-from posekit.search import SearchOptions, box_overlap, estimates_of, find_instances, judged
+from posekit.search import SearchOptions, estimates_of, find_instances, judged
 from posekit.track import LOST, RESTARTED, Tracker
 from posekit.view import View
 from test_refine import Oracle

@@ -127,6 +127,14 @@ def mask_box(mask: NDArray[np.bool_]) -> Box | None:
     return float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1)
 
 
+def box_overlap(a: Box, b: Box) -> float:
+    """Intersection over union of two boxes (edges)."""
+    width = min(a[2], b[2]) - max(a[0], b[0])
+    height = min(a[3], b[3]) - max(a[1], b[1])
+    both = max(width, 0.0) * max(height, 0.0)
+    return both / max((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - both, 1e-9)
+
+
 @dataclass(frozen=True, eq=False)
 class Zoom:
     """From a photograph's camera to a virtual one that looks straight at the object.

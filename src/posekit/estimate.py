@@ -12,6 +12,7 @@ import numpy as np
 from posekit.camera import Box, mask_box
 from posekit.contour import fit_contour
 from posekit.errors import ConfigError
+from posekit.features import FeatureSearch
 from posekit.geometry import Pose
 from posekit.hypotheses import (
     Agreement,
@@ -94,6 +95,7 @@ class PoseEstimator:
         self.refine_options = options.refine_options(self.predictor.dense)
         self.renderer = Renderer()
         self._search: BoxSearch | MVNetSearch | None = None
+        self._features = FeatureSearch(model, self.renderer)
         if options.init == "mvnet":
             self._search = MVNetSearch(model, self.networks, self.renderer)
 
@@ -169,7 +171,8 @@ class PoseEstimator:
         return [heat if done else heat.then(next(ends), options.stop) for heat, done in zip(heats, there, strict=True)]
 
     def first_poses(self, view: View, detection: Detection) -> list[Hypothesis]:
-        """The first poses that ``options.init`` gives, best first; those for a detection's rough mask come last."""
+        """The first poses that ``options.init`` gives, best first; those for a detection's rough mask come last. Those
+        that the mesh's texture gives come before ``templates``'s."""
         if self._search is None:
             self._search = BoxSearch(self.model, self.renderer)
         found: list[Hypothesis] = []
@@ -177,7 +180,10 @@ class PoseEstimator:
             if mask is not None or not found:
                 box = detection.box if mask is None or detection.rough is None else mask_box(mask) or detection.box
                 found += self._search.search(view, replace(detection, box=box, mask=mask), self.options.hypotheses)
-        return found
+        if self.options.init != "templates":
+            return found
+        textured = self._features.search(view, detection.box)
+        return [Hypothesis(each.T_cam_obj, each.share) for each in textured] + found
 
     def _choose(
         self,

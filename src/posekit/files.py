@@ -31,6 +31,12 @@ def write_bytes_atomic(path: Path, data: bytes) -> None:
         raise
 
 
+def user_cache(name: str) -> Path:
+    """The folder for what can be made anew: under XDG_CACHE_HOME, else ~/.cache. It need not exist."""
+    root = os.environ.get("XDG_CACHE_HOME")
+    return (Path(root) if root else Path.home() / ".cache") / "posekit" / name
+
+
 def write_text_atomic(path: Path, text: str) -> None:
     """As `write_bytes_atomic`, UTF-8."""
     write_bytes_atomic(path, text.encode("utf-8"))

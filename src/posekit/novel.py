@@ -20,13 +20,14 @@ import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 
-from posekit.camera import Camera
+from posekit.camera import Box, Camera, box_overlap
 from posekit.detect import Detector
 from posekit.detect.backbones import LITE0_MEAN, LITE0_STD, Lite0, lite0_imagenet, load_lite0
 from posekit.detect.maskrcnn import COCO, DOUBTFUL, SHIPPED, MaskRCNN, TrainedDetector, find, load_coco, load_detector
 from posekit.detect.sharpen import sharpened
 from posekit.detect.vision import torchvision
 from posekit.errors import ConfigError
+from posekit.features import FeatureSearch
 from posekit.geometry import Pose, fibonacci_sphere, view_rotation
 from posekit.hypotheses import TemplateSearch
 from posekit.object_model import ObjectModel
@@ -162,15 +163,32 @@ class NovelDetector:
             )
         self.detector, self.renderer, self.options = detector, renderer, options
         self.likeness = Likeness(renderer, options)
+        self._textured: dict[ObjectModel, FeatureSearch] = {}
 
     def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
-        """The instances of the models, each model's best first; with no models, whatever looks like an object."""
+        """The instances of the models, those found by local features first; with no models, whatever looks like an
+        object."""
         proposals = self.propose(view)
-        if not models or not proposals:
+        if not models:
             return proposals
+        known = [each for model in models for each in self._by_features(view, model)]
+        if not proposals:
+            return known
         looks = self.likeness.looks(view, proposals)
         found = [each for model in models for each in self._instances(view, model, proposals, looks)]
-        return [sharpened(view.image, each) for each in found]
+        new = [each for each in found if not any(_same_instance(each, other, self.options.overlap) for other in known)]
+        return known + [sharpened(view.image, each) for each in new]
+
+    def _by_features(self, view: View, model: ObjectModel) -> list[Detection]:
+        """Boxes of the instances that local features find; half of the score is reached by the least inliers."""
+        if model not in self._textured:
+            self._textured[model] = FeatureSearch(model, self.renderer)
+        search = self._textured[model]
+        least, size = search.options.least, view.camera.size
+        return [
+            Detection(clipped(each.box, size), None, each.inliers / (each.inliers + least), model.name, Source.FEATURES)
+            for each in search.search(view)[: self.options.most]
+        ]
 
     def propose(self, view: View) -> list[Detection]:
         """Objects of any kind, by falling score."""
@@ -256,6 +274,17 @@ def _chroma(pictures: Sequence[View]) -> FArray:
         inside = mask if mask is not None and mask.any() else np.ones(picture.image.shape[:2], np.bool_)
         rows.append(np.median(cv2.cvtColor(picture.image, cv2.COLOR_RGB2LAB)[inside][:, 1:], axis=0))
     return np.asarray(rows, np.float32).reshape(-1, 2)
+
+
+def clipped(box: Box, size: tuple[int, int]) -> Box:
+    """A box's part (edges) in a picture of that (width, height)."""
+    x0, y0, x1, y1 = np.clip(box, 0, [*size, *size])
+    return float(x0), float(y0), float(x1), float(y1)
+
+
+def _same_instance(a: Detection, b: Detection, overlap: float) -> bool:
+    """Whether two detections of one mesh have boxes that lie on each other."""
+    return a.label == b.label and box_overlap(a.box, b.box) >= overlap
 
 
 def _overlap(a: Detection, b: Detection) -> float:

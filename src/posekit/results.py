@@ -27,6 +27,7 @@ class Source(StrEnum):
     FILLED = "box+filled"  # a person's box, taken as the mask
     MASK = "mask"  # a person's mask
     FILE = "file"  # another program's result
+    FEATURES = "features"  # local features of a textured mesh
     NOVEL = "novel"  # the detector for any mesh; its score is the similarity to the mesh
     TRAINED = "mask-rcnn"  # a detector that was trained for its classes
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from posekit.camera import Box
+from posekit.camera import box_overlap
 from posekit.errors import ConfigError
 from posekit.novel import USUAL, WEIGHT, shifted
 from posekit.object_model import ObjectModel
@@ -111,11 +111,3 @@ def judged(found: Found) -> list[Detection]:
     scores = {id(each.detection): each.score for each in found.estimates}
     scored = [replace(each, score=scores.get(id(each), 0.0)) for each in found.detections]
     return sorted(scored, key=lambda d: -d.score)
-
-
-def box_overlap(a: Box, b: Box) -> float:
-    """Intersection over union of two boxes (edges)."""
-    width = min(a[2], b[2]) - max(a[0], b[0])
-    height = min(a[3], b[3]) - max(a[1], b[1])
-    both = max(width, 0.0) * max(height, 0.0)
-    return both / max((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - both, 1e-9)
