@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from posekit import __version__
+from posekit import __version__, results
 from posekit.cli import doctor
 from posekit.cli.app import app
 from posekit.data.example import Example, make_example, ply
@@ -137,6 +137,23 @@ def test_estimate_writes_a_result_and_an_overlay(invoke: Invoke, tmp_path: Path)
     overlay = cv2.imread(str(out / "overlay.png"))
     assert overlay.shape[1] == 640
     assert overlay.shape[0] > 480
+
+
+@pytest.mark.parametrize("command", ["estimate", "refine"])
+@pytest.mark.parametrize("least", [0.0, 2.0])
+def test_what_is_not_reliable_says_so_first(
+    invoke: Invoke, monkeypatch: pytest.MonkeyPatch, command: str, least: float
+) -> None:
+    monkeypatch.setattr(results, "RELIABLE_SCORE", least)
+    monkeypatch.setattr(results, "RELIABLE_ANGLE_DEG", 180.0)
+    found = invoke(command, None, "--require-reliable", json="-")
+    reliable = least == 0.0
+    assert found.exit_code == (0 if reliable else 3), found.output
+    assert json.loads(found.stdout)["estimates"][0]["reliable"] is reliable, "written all the same"
+    first = next(line for line in found.stderr.splitlines() if line.startswith("toy: "))
+    assert first.startswith("toy: reliable:" if reliable else "toy: NOT RELIABLE:")
+    assert "converged" not in found.stderr
+    assert invoke(command, json="-").exit_code == 0, "it has to be asked for"
 
 
 def test_json_on_standard_output_is_alone_there(invoke: Invoke, tmp_path: Path) -> None:

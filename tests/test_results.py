@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import stat
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,16 @@ from posekit.errors import OutputError, PromptError
 from posekit.files import write_bytes_atomic, write_text_atomic
 from posekit.geometry import Pose, random_rotation
 from posekit.load import load_pose
-from posekit.results import Detection, Estimate, Step, estimate_to_json, estimates_from_json, estimates_to_json
+from posekit.results import (
+    RELIABLE_ANGLE_DEG,
+    RELIABLE_SCORE,
+    Detection,
+    Estimate,
+    Step,
+    estimate_to_json,
+    estimates_from_json,
+    estimates_to_json,
+)
 
 POSE = Pose(random_rotation(np.random.default_rng(0)), [0.1, -0.2, 0.9])
 
@@ -33,6 +43,26 @@ def estimate(angle: float = 0.02) -> Estimate:
         trace=(Step(Pose.identity(), 0.4), Step(POSE, angle)),
         timings={"refine": 0.25, "total": 0.5},
     )
+
+
+@pytest.mark.parametrize(
+    ("angle_deg", "score", "words"),
+    [
+        (2.2, 0.9, "reliable: expected rotation error about 2 degrees"),
+        (RELIABLE_ANGLE_DEG - 0.1, RELIABLE_SCORE, "reliable: expected rotation error about 15 degrees"),
+        (0.4, 0.9, "reliable: expected rotation error below 1 degree"),
+        (1.2, 0.9, "reliable: expected rotation error about 1 degree"),
+        (23.8, 0.9, "NOT RELIABLE: estimated rotation error about 24 degrees"),
+        (2.2, 0.1, "NOT RELIABLE: the picture hardly shows this object in this pose; estimated rotation error about 2"),
+        (float("nan"), 0.9, "NOT RELIABLE: estimated rotation error unknown"),
+    ],
+)
+def test_a_verdict_needs_both_score_and_angle(angle_deg: float, score: float, words: str) -> None:
+    found = replace(estimate(float(np.deg2rad(angle_deg))), score=score)
+    assert found.reliable == words.startswith("reliable")
+    assert found.verdict.startswith(words)
+    assert found.angle_deg == pytest.approx(angle_deg, nan_ok=True)
+    assert json.loads(estimate_to_json(found))["estimates"][0]["reliable"] is found.reliable
 
 
 def no_constant(name: str) -> float:

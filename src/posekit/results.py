@@ -17,6 +17,10 @@ from posekit.camera import Box
 from posekit.errors import PromptError
 from posekit.geometry import Pose
 
+# An estimate is reliable from this score on and up to this predicted rotation error (docs/conventions.md).
+RELIABLE_SCORE = 0.5
+RELIABLE_ANGLE_DEG = 15.0
+
 
 @dataclass(frozen=True, eq=False)
 class Detection:
@@ -42,6 +46,11 @@ class Step:
     T_cam_obj: Pose
     angle: float
 
+    @property
+    def angle_deg(self) -> float:
+        """The predicted rotation error, degrees."""
+        return math.degrees(self.angle)
+
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
@@ -63,6 +72,35 @@ class Estimate:
     detection: Detection | None = None
     trace: tuple[Step, ...] = ()
     timings: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def angle_deg(self) -> float:
+        """The predicted rotation error, degrees."""
+        return math.degrees(self.angle)
+
+    @property
+    def reliable(self) -> bool:
+        """Whether score and predicted rotation error say that the pose can be used; an angle that is NaN says no."""
+        return self.score >= RELIABLE_SCORE and self.angle_deg <= RELIABLE_ANGLE_DEG
+
+    @property
+    def verdict(self) -> str:
+        """Whether the estimate is reliable, in words, and how far it may be off."""
+        error = f"rotation error {angle_in_words(self.angle_deg)}"
+        if self.reliable:
+            return f"reliable: expected {error}"
+        if self.score >= RELIABLE_SCORE:
+            return f"NOT RELIABLE: estimated {error}"
+        return f"NOT RELIABLE: the picture hardly shows this object in this pose; estimated {error}"
+
+
+def angle_in_words(degrees: float) -> str:
+    """ "about 2 degrees", rounded as far as a predicted error is meaningful."""
+    if math.isnan(degrees):
+        return "unknown"
+    if degrees < 1:
+        return "below 1 degree"
+    return f"about {degrees:.0f} degree{'' if round(degrees) == 1 else 's'}"
 
 
 def estimates_to_json(
@@ -113,7 +151,8 @@ def _estimate_to_dict(estimate: Estimate) -> dict[str, Any]:
         "T_cam_obj": estimate.T_cam_obj.matrix.tolist(),
         "quat_wxyz": estimate.T_cam_obj.quat_wxyz.tolist(),
         "t_m": estimate.T_cam_obj.t.tolist(),
-        "angle_deg": math.degrees(estimate.angle),
+        "reliable": estimate.reliable,
+        "angle_deg": estimate.angle_deg,
         "iterations": estimate.iterations,
         "converged": estimate.converged,
         "score": estimate.score,
@@ -121,8 +160,7 @@ def _estimate_to_dict(estimate: Estimate) -> dict[str, Any]:
         "detection": found
         and {"box": list(found.box), "score": found.score, "label": found.label, "source": found.source},
         "trace": [
-            {"T_cam_obj": step.T_cam_obj.matrix.tolist(), "angle_deg": math.degrees(step.angle)}
-            for step in estimate.trace
+            {"T_cam_obj": step.T_cam_obj.matrix.tolist(), "angle_deg": step.angle_deg} for step in estimate.trace
         ],
         "timings_s": dict(estimate.timings),
     }

@@ -25,6 +25,7 @@ from posekit.cli.options import (
     OutlineOption,
     OutOption,
     PresetOption,
+    RequireReliableOption,
     SeedOption,
     StopAngleOption,
     StopOption,
@@ -83,9 +84,10 @@ def estimate(
     out: OutOption = None,
     force: ForceOption = False,
     json: JsonOption = None,
+    require_reliable: RequireReliableOption = False,
 ) -> None:
     """Estimate objects' poses in a photograph, from their meshes. A box, a mask or detections help, but need not be."""
-    from posekit.cli.output import Destination
+    from posekit.cli.output import Destination, end_unless_reliable
 
     destination = Destination.chosen(out, Path("posekit-out") / image.stem, force, json)
 
@@ -127,3 +129,5 @@ def estimate(
         ]
     paths = [{"image": image, "mesh": path} for path in model]
     destination.deliver_all(view, results, paths)
+    if require_reliable:
+        end_unless_reliable([each for _, estimates in results for each in estimates])

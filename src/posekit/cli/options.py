@@ -13,6 +13,7 @@ Stop = Literal["angle", "fixed"]
 MaskFrom = Literal["none", "grabcut", "filled"]
 
 INPUT, LOOP, OUTPUT = "Input", "Refinement", "Output"
+NOT_RELIABLE = 3  # exit code of --require-reliable
 
 ImageArgument = Annotated[Path, typer.Argument(help="The photograph.", show_default=False)]
 ModelOption = Annotated[
@@ -110,6 +111,15 @@ ThreadsOption = Annotated[
     int | None, typer.Option(min=1, help="Threads of torch; by default its own choice.", rich_help_panel=LOOP)
 ]
 
+RequireReliableOption = Annotated[
+    bool,
+    typer.Option(
+        "--require-reliable",
+        help="End with exit code 3 where a result is not reliable, or nothing is found; results are written all the "
+        "same.",
+        rich_help_panel=OUTPUT,
+    ),
+]
 OutOption = Annotated[
     Path | None,
     typer.Option(metavar="DIR", help="Folder for the results; it must be new or empty.", rich_help_panel=OUTPUT),

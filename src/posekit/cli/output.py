@@ -10,9 +10,9 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
 
-import numpy as np
 import typer
 
+from posekit.cli.options import NOT_RELIABLE
 from posekit.errors import OutputError
 from posekit.files import write_bytes_atomic, write_text_atomic
 from posekit.results import Estimate, estimates_to_json
@@ -147,15 +147,21 @@ def _overlays(view: View, results: Sequence[tuple[PoseEstimator, Sequence[Estima
 
 
 def describe(estimate: Estimate) -> str:
-    """An estimate for a person, some lines."""
+    """An estimate for a person, some lines: first whether it can be used."""
     rows = "\n".join("    " + " ".join(f"{value:9.5f}" for value in row) for row in estimate.T_cam_obj.matrix)
-    state = "converged" if estimate.converged else "not converged"
     steps = f"{estimate.iterations} iteration{'' if estimate.iterations == 1 else 's'}"
+    colour = None if estimate.reliable else typer.colors.RED
     return (
-        f"{estimate.model}: T_cam_obj (metres)\n{rows}\n"
-        f"    predicted error {np.rad2deg(estimate.angle):.1f} degrees, {state} after {steps}, "
-        f"score {estimate.score:.2f}, {estimate.timings['total']:.1f} s"
+        f"{estimate.model}: {typer.style(estimate.verdict, fg=colour, bold=True)}\n"
+        f"    score {estimate.score:.2f}, {steps}, {estimate.timings['total']:.1f} s\n"
+        f"    T_cam_obj (metres)\n{rows}"
     )
+
+
+def end_unless_reliable(estimates: Sequence[Estimate]) -> None:
+    """For ``--require-reliable``: exit code 3 where there is no estimate, or one that is not reliable."""
+    if not estimates or not all(estimate.reliable for estimate in estimates):
+        raise typer.Exit(NOT_RELIABLE)
 
 
 def _result(

@@ -23,6 +23,7 @@ from posekit.cli.options import (
     OutlineOption,
     OutOption,
     PresetOption,
+    RequireReliableOption,
     SeedOption,
     StopAngleOption,
     StopOption,
@@ -63,9 +64,10 @@ def refine(
     out: OutOption = None,
     force: ForceOption = False,
     json: JsonOption = None,
+    require_reliable: RequireReliableOption = False,
 ) -> None:
     """Refine a pose that is roughly known; a mask or a box helps, but neither is needed."""
-    from posekit.cli.output import Destination
+    from posekit.cli.output import Destination, end_unless_reliable
 
     destination = Destination.chosen(out, Path("posekit-out") / f"{image.stem}-refined", force, json)
 
@@ -95,3 +97,5 @@ def refine(
     with destination.working("refining"):
         refined = estimator.refine(view, start)
     destination.deliver(estimator, view, [refined], {"image": image, "mesh": model})
+    if require_reliable:
+        end_unless_reliable([refined])

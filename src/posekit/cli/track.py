@@ -15,6 +15,7 @@ import typer
 from posekit.cli.options import (
     INPUT,
     LOOP,
+    NOT_RELIABLE,
     OUTPUT,
     CameraOption,
     DetectorOption,
@@ -22,6 +23,7 @@ from posekit.cli.options import (
     ModelsOption,
     OutOption,
     PresetOption,
+    RequireReliableOption,
     SymmetryOption,
     ThreadsOption,
     UnitsOption,
@@ -93,6 +95,7 @@ def track(
     frames: Annotated[int | None, typer.Option(min=1, help="Frames at most.", rich_help_panel=OUTPUT)] = None,
     out: OutOption = None,
     force: ForceOption = False,
+    require_reliable: RequireReliableOption = False,
 ) -> None:
     """Follow objects through a video: poses as they come, and an overlay to look at."""
     from posekit.cli.output import OutputFolder
@@ -133,6 +136,7 @@ def track(
         for mesh, start in zip(meshes, starts, strict=True)
     ]  # fmt: skip
     counts = _run(trackers, sequence, folder, overlay, rerun, frames)
+    typer.echo(f"reliable: {counts.reliable} of {counts.used * len(trackers)} poses")
     typer.echo(", ".join(f"{count} {state}" for state, count in counts.states.items()))
     if counts.problems:
         typer.echo(f"{len(counts.problems)} frames could not be used; the first: {counts.problems[0]}", err=True)
@@ -145,6 +149,8 @@ def track(
     if not counts.states.get("tracked", 0) + counts.states.get("restarted", 0):
         names = ", ".join(m.name for m in meshes)
         raise PromptError(f"{names} was found in none of {counts.used} frames: pass --pose FILE for the first one.")
+    if require_reliable and counts.reliable < counts.used * len(trackers):
+        raise typer.Exit(NOT_RELIABLE)
 
 
 class _Counts:
@@ -152,6 +158,7 @@ class _Counts:
 
     def __init__(self) -> None:
         self.used = 0
+        self.reliable = 0
         self.states: dict[str, int] = {}
         self.problems: list[str] = []
         self.files: list[str] = ["poses.jsonl", "poses.csv"]
@@ -210,6 +217,7 @@ def _step(trackers: Sequence[Tracker], frame: Frame, counts: _Counts) -> list[Tr
         results = [tracker.step(frame.image, frame.camera) for tracker in trackers]
     for result in results:
         counts.states[result.state] = counts.states.get(result.state, 0) + 1
+        counts.reliable += result.reliable
     return results
 
 
@@ -220,6 +228,7 @@ def _line(frame: Frame, name: str, result: Tracked) -> str:
         **({"file": frame.file} if frame.file else {}),
         "model": name,
         "state": result.state,
+        "reliable": result.reliable,
         "T_cam_obj": None if pose is None else pose.matrix.tolist(),
         "angle_deg": None if angle is None else math.degrees(angle),
         "score": None if result.estimate is None else result.estimate.score,
@@ -255,14 +264,14 @@ def _draw(writer: VideoWriter, frame: Frame, trackers: Sequence[Tracker], result
     picture, told = frame.image, []
     for tracker, result in zip(trackers, results, strict=True):
         angle = "" if result.angle is None else f" {math.degrees(result.angle):.1f} deg"
-        told.append(f"{tracker.model.name}: {result.state}{angle}")
+        told.append(f"{tracker.model.name}: {result.state}{angle}{'' if result.reliable else ' NOT RELIABLE'}")
         if result.T_cam_obj is None:
             continue
         [drawn] = tracker.estimator.renderer.render(
             tracker.model, [result.T_cam_obj], frame.camera, rgb=False, coords=False
         )
         assert drawn.mask is not None
-        picture = draw.contour(picture, drawn.mask)
+        picture = draw.contour(picture, drawn.mask, draw.GREEN if result.reliable else draw.RED)
         length = 0.6 * float(tracker.model.extents.max())
         picture = draw.axes(picture, frame.camera, result.T_cam_obj, length, tracker.model.center)
     writer.write(draw.caption(picture, f"{frame.number}  " + "  ".join(told)))
