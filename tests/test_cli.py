@@ -135,8 +135,7 @@ def test_estimate_writes_a_result_and_an_overlay(invoke: Invoke, tmp_path: Path)
     assert sorted(path.name for path in out.iterdir()) == ["overlay.png", "result.json"]
     assert_result((out / "result.json").read_text())
     overlay = cv2.imread(str(out / "overlay.png"))
-    assert overlay.shape[1] == 640
-    assert overlay.shape[0] > 480
+    assert overlay.shape[1] > 640 and overlay.shape[0] > 480
 
 
 @pytest.mark.parametrize("command", ["estimate", "refine"])

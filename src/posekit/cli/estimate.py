@@ -10,6 +10,7 @@ import typer
 
 from posekit.cli.options import (
     LOOP,
+    BlendOption,
     BoxOption,
     CameraOption,
     ContourOption,
@@ -84,6 +85,7 @@ def estimate(
     out: OutOption = None,
     force: ForceOption = False,
     json: JsonOption = None,
+    blend: BlendOption = 0.0,
     require_reliable: RequireReliableOption = False,
 ) -> None:
     """Estimate objects' poses in a photograph, from their meshes. A box, a mask or detections help, but need not be."""
@@ -128,6 +130,6 @@ def estimate(
             for estimator in estimators
         ]
     paths = [{"image": image, "mesh": path} for path in model]
-    destination.deliver_all(view, results, paths)
+    destination.deliver_all(view, results, paths, blend)
     if require_reliable:
         end_unless_reliable([each for _, estimates in results for each in estimates])

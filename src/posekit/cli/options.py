@@ -111,6 +111,13 @@ ThreadsOption = Annotated[
     int | None, typer.Option(min=1, help="Threads of torch; by default its own choice.", rich_help_panel=LOOP)
 ]
 
+BlendOption = Annotated[
+    float,
+    typer.Option(
+        min=0, max=1, metavar="SHARE", help="How much of the rendered mesh the overlay shows, 0 to 1.",
+        rich_help_panel=OUTPUT,
+    ),
+]  # fmt: skip
 RequireReliableOption = Annotated[
     bool,
     typer.Option(
@@ -122,7 +129,11 @@ RequireReliableOption = Annotated[
 ]
 OutOption = Annotated[
     Path | None,
-    typer.Option(metavar="DIR", help="Folder for the results; it must be new or empty.", rich_help_panel=OUTPUT),
+    typer.Option(
+        metavar="DIR",
+        help="Folder for the results, new or empty. By default in posekit-out, or the next free posekit-out-2, -3.",
+        rich_help_panel=OUTPUT,
+    ),
 ]
 ForceOption = Annotated[
     bool, typer.Option("--force", help="Write into a folder that holds files already.", rich_help_panel=OUTPUT)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -42,6 +43,19 @@ class OutputFolder:
         if occupied and not self.force:
             raise OutputError(f"the folder {self.path} holds files: pass --force to write into it, or another --out.")
         _check_writable(self.path, f"the output folder {self.path} cannot be written")
+
+    @classmethod
+    def chosen(cls, out: Path | None, default: Path, force: bool) -> OutputFolder:
+        """``out`` where it is given; else the default, with a number behind its first part where that holds files:
+        posekit-out/photo, posekit-out-2/photo, posekit-out-3/photo."""
+        if out is not None or force:
+            return cls(out or default, force)
+        first, *rest = default.parts
+        for number in itertools.count(1):
+            path = Path(first if number == 1 else f"{first}-{number}", *rest)
+            if not path.is_dir() or not any(path.iterdir()):
+                return cls(path)
+        raise AssertionError("counting has no end")
 
     def write(self, name: str, data: bytes | str) -> Path:
         """Write one file, whole or not at all, and return its path."""
@@ -92,7 +106,7 @@ class Destination:
             _check_writable(Path(json).parent, f"--json {json} cannot be written")
         if out is None and json is not None:
             return cls(None, json)
-        return cls(OutputFolder(out or default, force), json)
+        return cls(OutputFolder.chosen(out, default, force), json)
 
     def say(self, text: str) -> None:
         """Tell the person something; on standard error where standard output is for JSON."""
@@ -107,18 +121,25 @@ class Destination:
             yield
 
     def deliver(
-        self, estimator: PoseEstimator, view: View, estimates: Sequence[Estimate], files: Mapping[str, Path]
+        self,
+        estimator: PoseEstimator,
+        view: View,
+        estimates: Sequence[Estimate],
+        files: Mapping[str, Path],
+        blend: float = 0.0,
     ) -> None:
         """`deliver_all` of one mesh. files: what they were made from, by name, for the result."""
-        self.deliver_all(view, [(estimator, estimates)], [files])
+        self.deliver_all(view, [(estimator, estimates)], [files], blend)
 
     def deliver_all(
         self,
         view: View,
         results: Sequence[tuple[PoseEstimator, Sequence[Estimate]]],
         files: Sequence[Mapping[str, Path]],
+        blend: float = 0.0,
     ) -> None:
-        """Print the estimates and write them: one result as JSON, and an overlay for each mesh. files: by mesh."""
+        """Print the estimates and write them: one result as JSON, and one overlay. files: by mesh. blend: how much of
+        the rendered meshes the overlay shows."""
         for estimator, estimates in results:
             for estimate in estimates:
                 self.say(describe(estimate))
@@ -126,8 +147,7 @@ class Destination:
                 self.say(f"no pose: nothing in the picture could be taken for {estimator.model.name}.")
         result = _result(view, results, files)
         if self.folder is not None:
-            for name, data in _overlays(view, results):
-                self.say(f"overlay: {self.folder.write(name, data)}")
+            self.say(f"overlay: {self.folder.write('overlay.png', _overlay(view, results, blend))}")
             self.say(f"result: {self.folder.write('result.json', result)}")
         if self.json == "-":
             typer.echo(result, nl=False)
@@ -136,14 +156,13 @@ class Destination:
             self.say(f"result: {self.json}")
 
 
-def _overlays(view: View, results: Sequence[tuple[PoseEstimator, Sequence[Estimate]]]) -> Iterator[tuple[str, bytes]]:
-    """Names of files and PNGs: overlay.png of one mesh; of several overlay-1-NAME.png and so on."""
+def _overlay(view: View, results: Sequence[tuple[PoseEstimator, Sequence[Estimate]]], blend: float) -> bytes:
+    """All objects in one picture, PNG."""
     from posekit import draw
     from posekit.figures import overlay
 
-    for k, (estimator, estimates) in enumerate(results):
-        name = "overlay.png" if len(results) == 1 else f"overlay-{k + 1}-{estimator.model.name}.png"
-        yield name, draw.png(overlay(estimator.renderer, estimator.model, view, estimates))
+    found = [(estimator.model, estimate) for estimator, estimates in results for estimate in estimates]
+    return draw.png(overlay(results[0][0].renderer, view, found, blend))
 
 
 def describe(estimate: Estimate) -> str:

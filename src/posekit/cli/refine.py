@@ -10,6 +10,7 @@ import typer
 from posekit.cli.options import (
     INPUT,
     BesideOption,
+    BlendOption,
     BoxOption,
     CameraOption,
     ContourOption,
@@ -64,6 +65,7 @@ def refine(
     out: OutOption = None,
     force: ForceOption = False,
     json: JsonOption = None,
+    blend: BlendOption = 0.0,
     require_reliable: RequireReliableOption = False,
 ) -> None:
     """Refine a pose that is roughly known; a mask or a box helps, but neither is needed."""
@@ -96,6 +98,6 @@ def refine(
         estimator = PoseEstimator(mesh, preset=preset, weights=weights, options=options, threads=threads)
     with destination.working("refining"):
         refined = estimator.refine(view, start)
-    destination.deliver(estimator, view, [refined], {"image": image, "mesh": model})
+    destination.deliver(estimator, view, [refined], {"image": image, "mesh": model}, blend)
     if require_reliable:
         end_unless_reliable([refined])

@@ -36,7 +36,7 @@ def render_views(
     from posekit.object_model import ObjectModel
     from posekit.render import Renderer, render_views, view_rotations
 
-    folder = OutputFolder(out or Path("posekit-out") / f"{model.stem}-views", force)
+    folder = OutputFolder.chosen(out, Path("posekit-out") / f"{model.stem}-views", force)
     mesh = ObjectModel.load(model, units=units)
     renderer = Renderer(samples=4)
     rotations, thumbnails = view_rotations(views), []

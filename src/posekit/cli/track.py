@@ -100,7 +100,7 @@ def track(
     """Follow objects through a video: poses as they come, and an overlay to look at."""
     from posekit.cli.output import OutputFolder
 
-    folder = OutputFolder(out or Path("posekit-out") / f"{Path(source).stem or 'camera'}-track", force)
+    folder = OutputFolder.chosen(out, Path("posekit-out") / f"{Path(source).stem or 'camera'}-track", force)
 
     from posekit.errors import ImageError, PromptError
     from posekit.estimate import EstimateOptions, PoseEstimator
@@ -259,19 +259,17 @@ def _number(name: str, k: int) -> int:
 
 def _draw(writer: VideoWriter, frame: Frame, trackers: Sequence[Tracker], results: Sequence[Tracked]) -> None:
     from posekit import draw
+    from posekit.figures import outlined
 
     assert frame.image is not None and frame.camera is not None
     picture, told = frame.image, []
     for tracker, result in zip(trackers, results, strict=True):
-        angle = "" if result.angle is None else f" {math.degrees(result.angle):.1f} deg"
+        angle = "" if result.angle is None else f" {math.degrees(result.angle):.1f} degrees"
         told.append(f"{tracker.model.name}: {result.state}{angle}{'' if result.reliable else ' NOT RELIABLE'}")
         if result.T_cam_obj is None:
             continue
-        [drawn] = tracker.estimator.renderer.render(
-            tracker.model, [result.T_cam_obj], frame.camera, rgb=False, coords=False
-        )
-        assert drawn.mask is not None
-        picture = draw.contour(picture, drawn.mask, draw.GREEN if result.reliable else draw.RED)
+        colour = draw.GREEN if result.reliable else draw.RED
+        picture = outlined(tracker.renderer, picture, frame.camera, tracker.model, result.T_cam_obj, colour)
         length = 0.6 * float(tracker.model.extents.max())
         picture = draw.axes(picture, frame.camera, result.T_cam_obj, length, tracker.model.center)
     writer.write(draw.caption(picture, f"{frame.number}  " + "  ".join(told)))
