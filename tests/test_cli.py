@@ -11,6 +11,7 @@ import sys
 import time
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -21,6 +22,7 @@ from typer.testing import CliRunner, Result
 from posekit import __version__, results
 from posekit.cli import doctor
 from posekit.cli.app import app
+from posekit.cli.output import limits
 from posekit.data.example import Example, make_example, ply
 from posekit.nets.weights import build, save_networks
 from posekit.render import Renderer
@@ -212,6 +214,49 @@ def test_refine_takes_what_estimate_wrote(invoke: Invoke, tmp_path: Path) -> Non
     assert_result((tmp_path / "posekit-out" / "photo-refined" / "result.json").read_text())
 
 
+def test_what_the_mesh_and_the_picture_do_not_allow_is_said_once(example: Example) -> None:
+    plain = replace(example.model, colors=None)
+    near = results.Estimate(example.T_cam_obj, 0.1, 1, True, 0.9, (10.0, 10.0, 50.0, 30.0), "toy")
+    far = replace(near, box=(10.0, 10.0, 33.0, 49.0))
+    assert limits(example.model, [near]) == []
+    assert limits(plain, []) == [], "nothing was found, so nothing is uncertain"
+    [colours] = limits(plain, [near, near])
+    assert "has no colours" in colours
+    [size] = limits(example.model, [near, far, far])
+    assert "only 39 pixels large 2 of 3 times" in size
+
+
+def test_a_mesh_without_colours_is_told_of(invoke: Invoke, example: Example, tmp_path: Path) -> None:
+    (tmp_path / "grey.ply").write_text(ply(replace(example.model, colors=np.zeros_like(example.model.vertices, "u1"))))
+    lines = [
+        line
+        for line in (tmp_path / "grey.ply").read_text().splitlines()
+        if not line.startswith(("property uchar red", "property uchar green", "property uchar blue"))
+    ]
+    (tmp_path / "grey.ply").write_text("\n".join(line.removesuffix(" 0 0 0") for line in lines) + "\n")
+    found = invoke("refine", model=tmp_path / "grey.ply", units="m", json="-")
+    assert found.exit_code == 0, found.output
+    assert found.stderr.count("has no colours") == 1
+    assert "has no colours" not in invoke("refine", json="-").stderr
+
+
+def test_running_a_line_again_writes_beside_the_first_result(invoke: Invoke, tmp_path: Path) -> None:
+    for number in ("", "-2", "-3"):
+        found = invoke("render-views", None, views=1, size="16x16", units="m")
+        assert found.exit_code == 0, found.output
+        assert str(Path(f"posekit-out{number}/toy-views/contact_sheet.png")) in found.stdout
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["posekit-out", "posekit-out-2", "posekit-out-3"]
+    assert invoke("render-views", None, "--force", views=1, size="16x16", units="m").exit_code == 0
+    assert len(list(tmp_path.iterdir())) == 3, "--force writes into the first"
+
+
+def test_an_estimate_can_be_made_twice(invoke: Invoke, tmp_path: Path) -> None:
+    assert [invoke("estimate").exit_code for _ in range(2)] == [0, 0]
+    first, second = (tmp_path / name / "photo" / "result.json" for name in ("posekit-out", "posekit-out-2"))
+    assert_result(first.read_text())
+    assert_result(second.read_text())
+
+
 def test_render_views(invoke: Invoke, tmp_path: Path) -> None:
     result = invoke("render-views", None, views=6, size="64x48", out="views", units="m")
     assert result.exit_code == 0, result.output
@@ -230,7 +275,7 @@ def test_demo(invoke: Invoke, folder: Path, tmp_path: Path) -> None:
     assert "T_cam_obj" in result.stdout
     assert str(Path("posekit-out/demo/overlay.png")) in result.stdout
     assert (tmp_path / "posekit-out/demo/overlay.png").stat().st_size > 10_000
-    assert_fails(CliRunner().invoke(app, arguments), "--force")
+    assert_fails(CliRunner().invoke(app, [*arguments, "--out", "posekit-out/demo"]), "--force")
 
 
 def test_doctor_reports_every_part(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -78,7 +78,7 @@ def detect(
         raise ConfigError("--verify looks for poses of meshes: pass --model MESH, or leave it out.")
     if weights is not None and detector is not None:
         raise ConfigError("--weights and --detector were both given, and mean the same: pass one of them.")
-    folder = OutputFolder(out or Path("posekit-out") / f"{image.stem}-detections", force)
+    folder = OutputFolder.chosen(out, Path("posekit-out") / f"{image.stem}-detections", force)
     view = load_view(image, camera)
     meshes = [ObjectModel.load(path, units=units) for path in model or ()]
     finder, classes = make_detector(

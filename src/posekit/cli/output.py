@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,8 +19,12 @@ from posekit.errors import OutputError
 from posekit.files import write_bytes_atomic, write_text_atomic
 from posekit.results import Estimate, estimates_to_json
 
+SMALL = 40  # pixels, longer side of an object's box below which that is said
+log = logging.getLogger("posekit")
+
 if TYPE_CHECKING:
     from posekit.estimate import PoseEstimator
+    from posekit.object_model import ObjectModel
     from posekit.view import View
 
 
@@ -34,10 +39,7 @@ class OutputFolder:
     force: bool = False
 
     def __post_init__(self) -> None:
-        try:
-            occupied = self.path.is_dir() and any(self.path.iterdir())
-        except OSError as error:
-            raise OutputError(f"the output folder {self.path} cannot be read: {error.strerror}.") from error
+        occupied = _occupied(self.path)
         if self.path.exists() and not self.path.is_dir():
             raise OutputError(f"{self.path} is a file: --out names a folder.")
         if occupied and not self.force:
@@ -53,7 +55,7 @@ class OutputFolder:
         first, *rest = default.parts
         for number in itertools.count(1):
             path = Path(first if number == 1 else f"{first}-{number}", *rest)
-            if not path.is_dir() or not any(path.iterdir()):
+            if not _occupied(path):
                 return cls(path)
         raise AssertionError("counting has no end")
 
@@ -69,6 +71,14 @@ class OutputFolder:
         else:
             write_bytes_atomic(path, data)
         return path
+
+
+def _occupied(folder: Path) -> bool:
+    """Whether there is such a folder and it holds something. Raises OutputError where it cannot be read."""
+    try:
+        return folder.is_dir() and any(folder.iterdir())
+    except OSError as error:
+        raise OutputError(f"the output folder {folder} cannot be read: {error.strerror}.") from error
 
 
 def _check_writable(folder: Path, trouble: str) -> None:
@@ -145,6 +155,8 @@ class Destination:
                 self.say(describe(estimate))
             if not estimates:
                 self.say(f"no pose: nothing in the picture could be taken for {estimator.model.name}.")
+            for note in limits(estimator.model, estimates):
+                log.info(note)
         result = _result(view, results, files)
         if self.folder is not None:
             self.say(f"overlay: {self.folder.write('overlay.png', _overlay(view, results, blend))}")
@@ -175,6 +187,25 @@ def describe(estimate: Estimate) -> str:
         f"    score {estimate.score:.2f}, {steps}, {estimate.timings['total']:.1f} s\n"
         f"    T_cam_obj (metres)\n{rows}"
     )
+
+
+def limits(model: ObjectModel, estimates: Sequence[Estimate]) -> list[str]:
+    """What the mesh and the picture do not allow, each once, with what helps."""
+    notes = []
+    if estimates and model.colors is None and model.texture is None:
+        notes.append(
+            f"{model.name} has no colours: only its shape is compared, and a turn that leaves the silhouette as it is "
+            "may go unseen. A mesh with vertex colours or a texture helps."
+        )
+    sizes = [max(x1 - x0, y1 - y0) for x0, y0, x1, y1 in (estimate.box for estimate in estimates)]
+    small = [size for size in sizes if size < SMALL]
+    if small:
+        count = f"{len(small)} of {len(sizes)} times " if len(sizes) > 1 else ""
+        notes.append(
+            f"{model.name} is only {min(small):.0f} pixels large {count}in the picture: its rotation is uncertain "
+            f"below {SMALL}. Take the photograph from nearer, or with more pixels."
+        )
+    return notes
 
 
 def end_unless_reliable(estimates: Sequence[Estimate]) -> None:

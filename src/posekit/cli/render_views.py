@@ -20,7 +20,10 @@ def render_views(
     model: ModelOption,
     views: Annotated[int, typer.Option(help="6: the faces of a cube; else evenly over the sphere.")] = 6,
     out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="By default posekit-out/MESH-views; it must be new or empty.")
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="New or empty. By default posekit-out/MESH-views, or posekit-out-2 and so on."
+        ),
     ] = None,
     size: Annotated[str, typer.Option(metavar="WxH", help="Of each view, pixels.")] = "640x480",
     units: UnitsOption = "auto",
