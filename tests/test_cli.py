@@ -20,10 +20,13 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from posekit import __version__, results
+from posekit.camera import Camera
 from posekit.cli import doctor
 from posekit.cli.app import app
 from posekit.cli.output import limits
 from posekit.data.example import Example, make_example, ply
+from posekit.geometry import Pose
+from posekit.load import load_pose
 from posekit.nets.weights import build, save_networks
 from posekit.render import Renderer
 
@@ -250,6 +253,18 @@ def test_running_a_line_again_writes_beside_the_first_result(invoke: Invoke, tmp
     assert len(list(tmp_path.iterdir())) == 3, "--force writes into the first"
 
 
+def test_formats_for_other_programs(invoke: Invoke, folder: Path, tmp_path: Path) -> None:
+    flags = [word for name in ("csv", "ros", "blender", "unity", "tum", "json") for word in ("--format", name)]
+    found = invoke("refine", None, *flags, out="out")
+    assert found.exit_code == 0, found.output
+    names = {"objects.csv", "ros.yaml", "blender.json", "unity.json", "toy.tum", "result.json", "overlay.png"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == names
+    matrix = json.loads((tmp_path / "out/result.json").read_text())["estimates"][0]["T_cam_obj"]
+    np.testing.assert_allclose(load_pose(tmp_path / "out/toy.tum").matrix, matrix, atol=1e-9)
+    assert invoke("refine", pose=tmp_path / "out/toy.tum", json="-").exit_code == 0
+    assert_fails(invoke("refine", None, "--format", "csv", json="-"), "--format csv", "--out")
+
+
 def test_an_estimate_can_be_made_twice(invoke: Invoke, tmp_path: Path) -> None:
     assert [invoke("estimate").exit_code for _ in range(2)] == [0, 0]
     first, second = (tmp_path / name / "photo" / "result.json" for name in ("posekit-out", "posekit-out-2"))
@@ -257,14 +272,23 @@ def test_an_estimate_can_be_made_twice(invoke: Invoke, tmp_path: Path) -> None:
     assert_result(second.read_text())
 
 
-def test_render_views(invoke: Invoke, tmp_path: Path) -> None:
+def test_render_views(invoke: Invoke, example: Example, tmp_path: Path) -> None:
     result = invoke("render-views", None, views=6, size="64x48", out="views", units="m")
     assert result.exit_code == 0, result.output
     names = sorted(path.name for path in (tmp_path / "views").iterdir())
-    assert names == sorted([f"{k:04d}{end}.png" for k in range(6) for end in ("", "_mask")] + ["contact_sheet.png"])
+    assert names == sorted(
+        [f"{k:04d}{end}.png" for k in range(6) for end in ("", "_mask")] + ["contact_sheet.png", "views.json"]
+    )
     mask = cv2.imread(str(tmp_path / "views/0000_mask.png"), cv2.IMREAD_UNCHANGED)
     assert mask.shape == (48, 64)
     assert 0.05 < (mask > 0).mean() < 0.8
+    about = json.loads((tmp_path / "views" / "views.json").read_text())
+    (fx, _, cx), (_, fy, cy), _ = about["camera"]["K"]
+    camera = Camera(fx, fy, cx, cy, about["camera"]["width"], about["camera"]["height"])
+    pose = Pose.from_matrix(about["views"][0]["T_cam_obj"])
+    [drawn] = Renderer().render(example.model, [pose], camera)
+    assert about["views"][0]["mask"] == "0000_mask.png"
+    np.testing.assert_array_equal(drawn.mask, mask > 0)
 
 
 def test_demo(invoke: Invoke, folder: Path, tmp_path: Path) -> None:

@@ -141,7 +141,8 @@ def test_bop_rotations_that_are_a_little_too_large(tmp_path: Path) -> None:
     ("text", "why"),
     [
         ("{", "holds no pose"),
-        ("[1, 2]", "outermost"),
+        ("[1, 2]", "it has 2 numbers"),
+        ("[{}]", "outermost"),
         ("{}", "has no cam_R_m2c"),
         ('{"T_cam_obj": [[1, 2], [3, 4]]}', r"shape \(4, 4\)"),
         (json.dumps({"T_cam_obj": np.zeros((4, 4)).tolist()}), "not a rotation"),

@@ -17,6 +17,7 @@ from posekit.cli.options import (
     DetectionsOption,
     DetectorOption,
     ForceOption,
+    FormatOption,
     ImageArgument,
     IterationsOption,
     JsonOption,
@@ -86,12 +87,13 @@ def estimate(
     force: ForceOption = False,
     json: JsonOption = None,
     blend: BlendOption = 0.0,
+    format_: FormatOption = None,
     require_reliable: RequireReliableOption = False,
 ) -> None:
     """Estimate objects' poses in a photograph, from their meshes. A box, a mask or detections help, but need not be."""
     from posekit.cli.output import Destination, end_unless_reliable
 
-    destination = Destination.chosen(out, Path("posekit-out") / image.stem, force, json)
+    destination = Destination.chosen(out, Path("posekit-out") / image.stem, force, json, format_ or ())
 
     from posekit.cli.prompts import prompt_for
     from posekit.estimate import EstimateOptions, PoseEstimator

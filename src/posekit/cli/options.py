@@ -10,6 +10,7 @@ import typer
 Units = Literal["auto", "mm", "cm", "m", "in"]
 Update = Literal["correspondence", "regression"]
 Stop = Literal["angle", "fixed"]
+Format = Literal["json", "csv", "ros", "blender", "unity", "tum"]
 MaskFrom = Literal["none", "grabcut", "filled"]
 
 INPUT, LOOP, OUTPUT = "Input", "Refinement", "Output"
@@ -111,6 +112,15 @@ ThreadsOption = Annotated[
     int | None, typer.Option(min=1, help="Threads of torch; by default its own choice.", rich_help_panel=LOOP)
 ]
 
+FormatOption = Annotated[
+    list[Format] | None,
+    typer.Option(
+        "--format",
+        help="Also write the poses for other programs: objects.csv, ros.yaml, blender.json, unity.json or NAME.tum; "
+        "repeat it. json is result.json, which is written anyway.",
+        rich_help_panel=OUTPUT,
+    ),
+]
 BlendOption = Annotated[
     float,
     typer.Option(

@@ -7,7 +7,6 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
@@ -17,7 +16,8 @@ import typer
 from posekit.cli.options import NOT_RELIABLE
 from posekit.errors import OutputError
 from posekit.files import write_bytes_atomic, write_text_atomic
-from posekit.results import Estimate, estimates_to_json
+from posekit.pose_formats import NamedPose, pose_files
+from posekit.results import Estimate
 
 SMALL = 40  # pixels, longer side of an object's box below which that is said
 log = logging.getLogger("posekit")
@@ -100,14 +100,18 @@ def _check_writable(folder: Path, trouble: str) -> None:
 class Destination:
     """What ``--out``, ``--force`` and ``--json`` ask for, checked before any work is done.
 
-    json: None, "-" or a file. With ``--json`` and no ``--out`` no folder is written.
+    json: None, "-" or a file. With ``--json`` and no ``--out`` no folder is written. formats: of further files with
+    the poses.
     """
 
     folder: OutputFolder | None
     json: str | None
+    formats: tuple[str, ...] = ()
 
     @classmethod
-    def chosen(cls, out: Path | None, default: Path, force: bool, json: str | None) -> Destination:
+    def chosen(
+        cls, out: Path | None, default: Path, force: bool, json: str | None, formats: Sequence[str] = ()
+    ) -> Destination:
         if json is not None and json != "-":
             if Path(json).is_dir():
                 raise OutputError(f"--json {json} is a folder: give a file, or - for standard output.")
@@ -115,8 +119,10 @@ class Destination:
                 raise OutputError(f"--json {json}: there is no folder {Path(json).parent}. Make it first.")
             _check_writable(Path(json).parent, f"--json {json} cannot be written")
         if out is None and json is not None:
+            if set(formats) - {"json"}:
+                raise OutputError(f"--format {formats[0]} with --json writes into a folder: pass --out DIR too.")
             return cls(None, json)
-        return cls(OutputFolder.chosen(out, default, force), json)
+        return cls(OutputFolder.chosen(out, default, force), json, tuple(formats))
 
     def say(self, text: str) -> None:
         """Tell the person something; on standard error where standard output is for JSON."""
@@ -150,6 +156,8 @@ class Destination:
     ) -> None:
         """Print the estimates and write them: one result as JSON, and one overlay. files: by mesh. blend: how much of
         the rendered meshes the overlay shows."""
+        from posekit.api import result_json
+
         for estimator, estimates in results:
             for estimate in estimates:
                 self.say(describe(estimate))
@@ -157,10 +165,17 @@ class Destination:
                 self.say(f"no pose: nothing in the picture could be taken for {estimator.model.name}.")
             for note in limits(estimator.model, estimates):
                 log.info(note)
-        result = _result(view, results, files)
+        about: dict[str, object] = dict(files[0])
+        if len(files) > 1:
+            about["mesh"] = [each["mesh"] for each in files]
+        found = [estimate for _, estimates in results for estimate in estimates]
+        result = result_json(view, found, results[0][0].weights_hash, about)
         if self.folder is not None:
             self.say(f"overlay: {self.folder.write('overlay.png', _overlay(view, results, blend))}")
             self.say(f"result: {self.folder.write('result.json', result)}")
+            for format_ in dict.fromkeys(self.formats):
+                for name, text in pose_files(format_, [named_pose(each) for each in found]).items():
+                    self.say(f"{format_}: {self.folder.write(name, text)}")
         if self.json == "-":
             typer.echo(result, nl=False)
         elif self.json is not None:
@@ -189,6 +204,13 @@ def describe(estimate: Estimate) -> str:
     )
 
 
+def named_pose(estimate: Estimate, frame: int = 0, seconds: float | None = None) -> NamedPose:
+    """An estimate as other programs' formats take it."""
+    return NamedPose(
+        estimate.model, estimate.T_cam_obj, estimate.score, estimate.angle_deg, estimate.reliable, frame, seconds
+    )
+
+
 def limits(model: ObjectModel, estimates: Sequence[Estimate]) -> list[str]:
     """What the mesh and the picture do not allow, each once, with what helps."""
     notes = []
@@ -212,23 +234,3 @@ def end_unless_reliable(estimates: Sequence[Estimate]) -> None:
     """For ``--require-reliable``: exit code 3 where there is no estimate, or one that is not reliable."""
     if not estimates or not all(estimate.reliable for estimate in estimates):
         raise typer.Exit(NOT_RELIABLE)
-
-
-def _result(
-    view: View, results: Sequence[tuple[PoseEstimator, Sequence[Estimate]]], files: Sequence[Mapping[str, Path]]
-) -> str:
-    """The entries of one mesh as they are; of several, ``mesh`` lists them."""
-    camera, lens = view.camera, view.lens
-    about: dict[str, object] = dict(files[0])
-    seen_by: dict[str, object] = {"K": camera.K, "width": camera.width, "height": camera.height}
-    if lens is not None:  # boxes, masks and overlays are of the undistorted picture
-        taken = {"K": lens.camera.K, "width": lens.camera.width, "height": lens.camera.height}
-        seen_by["undistorted_from"] = {**taken, "model": lens.model, "distortion_coefficients": list(lens.coefficients)}
-    if len(files) > 1:
-        about["mesh"] = [each["mesh"] for each in files]
-    return estimates_to_json(
-        [estimate for _, estimates in results for estimate in estimates],
-        weights_hash=results[0][0].weights_hash,
-        versions={name: version(name) for name in ("torch", "numpy", "opencv-python-headless", "moderngl")},
-        about={**about, "camera": seen_by},
-    )

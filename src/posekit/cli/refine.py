@@ -15,6 +15,7 @@ from posekit.cli.options import (
     CameraOption,
     ContourOption,
     ForceOption,
+    FormatOption,
     ImageArgument,
     IterationsOption,
     JsonOption,
@@ -37,7 +38,11 @@ from posekit.cli.options import (
 
 PoseOption = Annotated[
     Path,
-    typer.Option(metavar="FILE", help="JSON: a result of estimate, or T_cam_obj (4x4, metres).", rich_help_panel=INPUT),
+    typer.Option(
+        metavar="FILE",
+        help="A result of estimate, JSON with T_cam_obj (4x4, metres), or text: a 4x4 matrix, or x y z qx qy qz qw.",
+        rich_help_panel=INPUT,
+    ),
 ]
 
 
@@ -66,12 +71,13 @@ def refine(
     force: ForceOption = False,
     json: JsonOption = None,
     blend: BlendOption = 0.0,
+    format_: FormatOption = None,
     require_reliable: RequireReliableOption = False,
 ) -> None:
     """Refine a pose that is roughly known; a mask or a box helps, but neither is needed."""
     from posekit.cli.output import Destination, end_unless_reliable
 
-    destination = Destination.chosen(out, Path("posekit-out") / f"{image.stem}-refined", force, json)
+    destination = Destination.chosen(out, Path("posekit-out") / f"{image.stem}-refined", force, json, format_ or ())
 
     from posekit.cli.prompts import detector_for
     from posekit.estimate import EstimateOptions, PoseEstimator

@@ -20,6 +20,7 @@ from posekit.cli.options import (
     CameraOption,
     DetectorOption,
     ForceOption,
+    FormatOption,
     ModelsOption,
     OutOption,
     PresetOption,
@@ -31,6 +32,7 @@ from posekit.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from posekit.pose_formats import NamedPose
     from posekit.track import Tracked, Tracker
     from posekit.video import Frame, Frames, VideoWriter
 
@@ -45,7 +47,7 @@ def track(
     camera: CameraOption = None,
     pose: Annotated[
         list[Path] | None,
-        typer.Option(metavar="FILE", help="First pose, JSON; once for each mesh.", rich_help_panel=INPUT),
+        typer.Option(metavar="FILE", help="First pose, as refine takes it; once for each mesh.", rich_help_panel=INPUT),
     ] = None,
     detector: DetectorOption = None,
     units: UnitsOption = "auto",
@@ -95,10 +97,12 @@ def track(
     frames: Annotated[int | None, typer.Option(min=1, help="Frames at most.", rich_help_panel=OUTPUT)] = None,
     out: OutOption = None,
     force: ForceOption = False,
+    format_: FormatOption = None,
     require_reliable: RequireReliableOption = False,
 ) -> None:
     """Follow objects through a video: poses as they come, and an overlay to look at."""
     from posekit.cli.output import OutputFolder
+    from posekit.pose_formats import pose_files
 
     folder = OutputFolder.chosen(out, Path("posekit-out") / f"{Path(source).stem or 'camera'}-track", force)
 
@@ -135,7 +139,10 @@ def track(
                 estimator=PoseEstimator(mesh, preset=preset, weights=weights, options=chosen, threads=threads))
         for mesh, start in zip(meshes, starts, strict=True)
     ]  # fmt: skip
-    counts = _run(trackers, sequence, folder, overlay, rerun, frames)
+    counts = _run(trackers, sequence, folder, overlay, rerun, frames, keep=bool(format_))
+    for kind in dict.fromkeys(format_ or ()):
+        for name, text in pose_files(kind, counts.poses).items():
+            counts.files.append(folder.write(name, text).name)
     typer.echo(f"reliable: {counts.reliable} of {counts.used * len(trackers)} poses")
     typer.echo(", ".join(f"{count} {state}" for state, count in counts.states.items()))
     if counts.problems:
@@ -161,13 +168,23 @@ class _Counts:
         self.reliable = 0
         self.states: dict[str, int] = {}
         self.problems: list[str] = []
+        self.poses: list[NamedPose] = []
         self.files: list[str] = ["poses.jsonl", "poses.csv"]
 
 
 def _run(
-    trackers: Sequence[Tracker], sequence: Frames, folder: Any, overlay: bool, rerun: bool, most: int | None
+    trackers: Sequence[Tracker],
+    sequence: Frames,
+    folder: Any,
+    overlay: bool,
+    rerun: bool,
+    most: int | None,
+    *,
+    keep: bool,
 ) -> _Counts:
-    """Track every frame, and write each as soon as it is done: a killed run keeps its frames."""
+    """Track every frame, and write each as soon as it is done: a killed run keeps its frames. keep: all poses, for
+    formats that are written at the end."""
+    from posekit.cli.output import named_pose
     from posekit.errors import OutputError
     from posekit.video import VideoWriter
 
@@ -194,6 +211,8 @@ def _run(
             for k, (tracker, result) in enumerate(zip(trackers, results, strict=True)):
                 lines.write(_line(frame, tracker.model.name, result) + "\n")
                 if result.estimate is not None:
+                    if keep:
+                        counts.poses.append(named_pose(result.estimate, frame.number, frame.seconds))
                     table.write(_row(frame, _number(tracker.model.name, k), result, seconds) + "\n")
             record(frame, results)
             if overlay and frame.image is not None:
