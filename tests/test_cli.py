@@ -25,7 +25,7 @@ from posekit.cli import doctor
 from posekit.cli.app import app
 from posekit.cli.output import limits
 from posekit.data.example import Example, make_example, ply
-from posekit.geometry import Pose
+from posekit.geometry import Pose, rotation_angle
 from posekit.load import load_pose
 from posekit.nets.weights import build, save_networks
 from posekit.render import Renderer
@@ -243,6 +243,19 @@ def test_a_mesh_without_colours_is_told_of(invoke: Invoke, example: Example, tmp
     assert "has no colours" not in invoke("refine", json="-").stderr
 
 
+def test_top_keeps_other_poses(invoke: Invoke) -> None:
+    found = invoke("estimate", top=3, json="-")
+    assert found.exit_code == 0, found.output
+    [entry] = json.loads(found.stdout)["estimates"]
+    assert len(entry["alternatives"]) == 2
+    poses = [Pose.from_matrix(e["T_cam_obj"]) for e in (entry, *entry["alternatives"])]
+    for k, pose in enumerate(poses):
+        assert all(rotation_angle(pose.R.T @ other.R) > np.deg2rad(9) for other in poses[:k])
+    assert "alternative 3: turned by" in found.stderr
+    assert_fails(invoke("estimate", top=9), "top 9", "--hypotheses")
+    assert json.loads(invoke("estimate", json="-").stdout)["estimates"][0]["alternatives"] == []
+
+
 def test_running_a_line_again_writes_beside_the_first_result(invoke: Invoke, tmp_path: Path) -> None:
     for number in ("", "-2", "-3"):
         found = invoke("render-views", None, views=1, size="16x16", units="m")
@@ -263,6 +276,7 @@ def test_formats_for_other_programs(invoke: Invoke, folder: Path, tmp_path: Path
     np.testing.assert_allclose(load_pose(tmp_path / "out/toy.tum").matrix, matrix, atol=1e-9)
     assert invoke("refine", pose=tmp_path / "out/toy.tum", json="-").exit_code == 0
     assert_fails(invoke("refine", None, "--format", "csv", json="-"), "--format csv", "--out")
+    assert_fails(invoke("refine", None, "--format", "xml"), "--format xml", "blender")
 
 
 def test_an_estimate_can_be_made_twice(invoke: Invoke, tmp_path: Path) -> None:

@@ -100,6 +100,17 @@ def test_round_trip() -> None:
     assert estimates_from_json(estimates_to_json([])) == []
 
 
+def test_alternatives_are_kept() -> None:
+    found = replace(estimate(), alternatives=(estimate(0.3), replace(estimate(0.4), score=0.1)))
+    [back] = estimates_from_json(estimate_to_json(found))
+    assert [(e.angle, e.score) for e in back.alternatives] == [pytest.approx((0.3, 0.8)), pytest.approx((0.4, 0.1))]
+    entry = json.loads(estimate_to_json(found))["estimates"][0]
+    assert [e["reliable"] for e in entry["alternatives"]] == [False, False]
+    del entry["alternatives"]
+    [old] = estimates_from_json(json.dumps({"estimates": [entry]}))
+    assert old.alternatives == (), "files from before"
+
+
 def test_what_is_not_finite_is_null() -> None:
     text = estimate_to_json(estimate(float("nan")), about={"loss": np.float32("inf")})
     data = json.loads(text, parse_constant=no_constant)

@@ -12,7 +12,7 @@ import numpy as np
 from posekit.camera import Box, mask_box
 from posekit.contour import fit_contour
 from posekit.errors import ConfigError
-from posekit.geometry import Pose
+from posekit.geometry import Pose, rotation_angle
 from posekit.hypotheses import (
     Agreement,
     BoxSearch,
@@ -36,6 +36,7 @@ SILHOUETTE, STRUCTURE, BLUR, BIAS = 4.1, 8.0, 3.0, -2.3  # of `presence`, fitted
 USUAL = 2.0  # pixels of the crop: the correspondences' expected error, where the network gives none
 FIRST, SEMIFINALISTS, HEATS, FINALISTS = 1, 4, 3, 2  # iterations after which only so many hypotheses go on
 DOUBT = 0.3  # evidence that outweighs a radian of predicted angle
+DIFFERENT = float(np.deg2rad(10.0))  # turn, or shift in diameters, from which an alternative is another pose
 BESIDE = float(np.deg2rad(12.0))  # how far from a known pose others are tried
 
 
@@ -45,8 +46,8 @@ class EstimateOptions:
     beside: whether poses beside a known
     one are tried too where it does not converge at once. contour: whether the pose is laid onto the mask's outline
     where the mask proves exact. outline: whether it is laid onto the one that the photograph's colours show where there
-    is no such mask. seed: for whatever is drawn at random. The rest is
-    RefineOptions', with the angle in degrees."""
+    is no such mask. seed: for whatever is drawn at random. top: poses that an estimate keeps, itself and
+    alternatives. The rest is RefineOptions', with the angle in degrees."""
 
     init: str = "templates"
     hypotheses: int = 5
@@ -58,12 +59,15 @@ class EstimateOptions:
     beside: bool = True
     contour: bool = True
     outline: bool = True
+    top: int = 1
 
     def __post_init__(self) -> None:
         if self.init not in INITS:
             raise ConfigError(f"init is one of {INITS}, not {self.init!r}.")
         if self.hypotheses < 1:
             raise ConfigError(f"at least 1 hypothesis is needed, not {self.hypotheses}.")
+        if not 1 <= self.top <= self.hypotheses:
+            raise ConfigError(f"top {self.top}: from 1 to {self.hypotheses}, the number of hypotheses (--hypotheses).")
         _ = self.refine_options  # checks the rest
 
     @property
@@ -141,7 +145,9 @@ class PoseEstimator:
         options = self.options.refine_options
         if len(starts) <= FINALISTS or options.iterations <= HEATS:
             return refine(view, self.model, starts, self.predictor, self.renderer, options)
-        heats = self._best(judge, self._on_outline(view, self._heats(view, starts, FIRST)), SEMIFINALISTS)
+        heats = self._best(
+            judge, self._on_outline(view, self._heats(view, starts, FIRST)), max(SEMIFINALISTS, self.options.top)
+        )
         heats = self._on_outline(view, self._onward(view, heats, HEATS - FIRST))
         if least > 0 and self._presence(view, self._best(judge, heats, 1)[0].T_cam_obj) < least:
             return heats
@@ -153,7 +159,7 @@ class PoseEstimator:
 
     def _finals(self, view: View, judge: Judge, heats: Sequence[Refinement]) -> list[Refinement]:
         """The best go on to the end."""
-        finalists = self._best(judge, heats, FINALISTS)
+        finalists = self._best(judge, heats, max(FINALISTS, self.options.top))
         return self._onward(view, finalists, self.options.refine_options.iterations - HEATS)
 
     def _best(self, judge: Judge, heats: Sequence[Refinement], count: int) -> list[Refinement]:
@@ -187,8 +193,24 @@ class PoseEstimator:
         detection: Detection | None,
         timings: dict[str, float],
     ) -> Estimate:
-        """The hypothesis with the best score: much evidence in the photograph, and a low predicted angle."""
-        best = self._on_contour(view, self._best(judge, refined, 1)[0])
+        """The hypothesis with the best score: much evidence in the photograph, and a low predicted angle. The next best
+        ones that differ from it and from each other are its alternatives."""
+        first, *others = self._best(judge, refined, len(refined) if self.options.top > 1 else 1)
+        kept = [self._estimate_of(view, first, detection, timings)]
+        for other in others:
+            if len(kept) < self.options.top and all(self._differ(other.T_cam_obj, k.T_cam_obj) for k in kept):
+                kept.append(self._estimate_of(view, other, detection, timings))
+        return replace(kept[0], alternatives=tuple(kept[1:]))
+
+    def _differ(self, a: Pose, b: Pose) -> bool:
+        """Whether two ``T_cam_obj`` are more than one pose that refinement ended in by two ways."""
+        moved = a.apply(self.model.center) - b.apply(self.model.center)
+        return bool(rotation_angle(a.R.T @ b.R) > DIFFERENT or np.linalg.norm(moved) > DIFFERENT * self.model.diameter)
+
+    def _estimate_of(
+        self, view: View, refined: Refinement, detection: Detection | None, timings: dict[str, float]
+    ) -> Estimate:
+        best = self._on_contour(view, refined)
         return Estimate(
             T_cam_obj=best.T_cam_obj,
             angle=best.angle,

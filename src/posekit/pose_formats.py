@@ -63,6 +63,7 @@ class NamedPose:
 def pose_files(format_: str, poses: Sequence[NamedPose]) -> dict[str, str]:
     """Names of files and their texts. "json" is posekit's own result, which is written in any case: no file more.
     Raises ConfigError for a format that is none of FORMATS."""
+    check_formats([format_])
     if format_ == "json":
         return {}
     if format_ == "csv":
@@ -73,9 +74,14 @@ def pose_files(format_: str, poses: Sequence[NamedPose]) -> dict[str, str]:
         return {"blender.json": _listed([_blender(each) for each in poses])}
     if format_ == "unity":
         return {"unity.json": _listed([_unity(each) for each in poses])}
-    if format_ == "tum":
-        return _tum(poses)
-    raise ConfigError(f"--format {format_}: choose from {', '.join(FORMATS)}.")
+    return _tum(poses)
+
+
+def check_formats(formats: Sequence[str]) -> None:
+    """Raises ConfigError for a format that is none of FORMATS."""
+    for each in formats:
+        if each not in FORMATS:
+            raise ConfigError(f"--format {each}: choose from {', '.join(FORMATS)}.")
 
 
 def to_blender(T_cam_obj: Pose) -> Pose:

@@ -59,7 +59,8 @@ class Estimate:
     angle: predicted rotation error, radians. iterations: used for this result. converged: whether the angle fell
     below the threshold. score: in [0, 1], how likely the object is there in this pose. box: of the object at this pose,
     edges, pixels. model: the mesh's name. detection: what it started from. trace: the poses on the way, first to last.
-    timings: seconds by stage.
+    timings: seconds by stage. alternatives: other poses that were refined to the end, best first, where they were asked
+    for.
     """
 
     T_cam_obj: Pose
@@ -72,6 +73,7 @@ class Estimate:
     detection: Detection | None = None
     trace: tuple[Step, ...] = ()
     timings: Mapping[str, float] = field(default_factory=dict)
+    alternatives: tuple[Estimate, ...] = ()
 
     @property
     def angle_deg(self) -> float:
@@ -163,6 +165,7 @@ def _estimate_to_dict(estimate: Estimate) -> dict[str, Any]:
             {"T_cam_obj": step.T_cam_obj.matrix.tolist(), "angle_deg": step.angle_deg} for step in estimate.trace
         ],
         "timings_s": dict(estimate.timings),
+        "alternatives": [_estimate_to_dict(other) for other in estimate.alternatives],
     }
 
 
@@ -180,6 +183,7 @@ def _estimate_from_dict(entry: Mapping[str, Any]) -> Estimate:
         and Detection(_box(found["box"]), None, _number(found["score"]), found["label"], found["source"]),
         trace=tuple(Step(Pose.from_matrix(s["T_cam_obj"]), _radians(s["angle_deg"])) for s in entry["trace"]),
         timings={stage: _number(seconds) for stage, seconds in entry["timings_s"].items()},
+        alternatives=tuple(_estimate_from_dict(other) for other in entry.get("alternatives", ())),
     )
 
 

@@ -44,6 +44,13 @@ InitOption = Annotated[
     Literal["templates", "mvnet"], typer.Option(help="Where first poses come from.", rich_help_panel=LOOP)
 ]
 HypothesesOption = Annotated[int, typer.Option(metavar="K", help="First poses to refine.", rich_help_panel=LOOP)]
+TopOption = Annotated[
+    int,
+    typer.Option(
+        min=1, metavar="N", help="Keep the N best poses of each object: the result and its alternatives.",
+        rich_help_panel=LOOP,
+    ),
+]  # fmt: skip
 InstancesOption = Annotated[
     int, typer.Option(min=1, metavar="N", help="Of each mesh at most, where it is looked for.", rich_help_panel=LOOP)
 ]
@@ -75,6 +82,7 @@ def estimate(
     weights: WeightsOption = None,
     init: InitOption = "templates",
     hypotheses: HypothesesOption = 5,
+    top: TopOption = 1,
     update: UpdateOption = "correspondence",
     stop: StopOption = "angle",
     iterations: IterationsOption = 50,
@@ -102,7 +110,7 @@ def estimate(
     from posekit.search import SearchOptions, estimate_instances
 
     options = EstimateOptions(
-        init, hypotheses, update, stop, iterations, stop_angle, seed, contour=contour, outline=outline
+        init, hypotheses, update, stop, iterations, stop_angle, seed, contour=contour, outline=outline, top=top
     )
     view = load_view(image, camera)
     meshes = [ObjectModel.load(path, units=units, symmetry=symmetry) for path in model]

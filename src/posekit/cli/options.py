@@ -10,7 +10,6 @@ import typer
 Units = Literal["auto", "mm", "cm", "m", "in"]
 Update = Literal["correspondence", "regression"]
 Stop = Literal["angle", "fixed"]
-Format = Literal["json", "csv", "ros", "blender", "unity", "tum"]
 MaskFrom = Literal["none", "grabcut", "filled"]
 
 INPUT, LOOP, OUTPUT = "Input", "Refinement", "Output"
@@ -113,9 +112,10 @@ ThreadsOption = Annotated[
 ]
 
 FormatOption = Annotated[
-    list[Format] | None,
+    list[str] | None,
     typer.Option(
         "--format",
+        metavar="csv|ros|blender|unity|tum|json",
         help="Also write the poses for other programs: objects.csv, ros.yaml, blender.json, unity.json or NAME.tum; "
         "repeat it. json is result.json, which is written anyway.",
         rich_help_panel=OUTPUT,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,7 +17,8 @@ import typer
 from posekit.cli.options import NOT_RELIABLE
 from posekit.errors import OutputError
 from posekit.files import write_bytes_atomic, write_text_atomic
-from posekit.pose_formats import NamedPose, pose_files
+from posekit.geometry import rotation_angle
+from posekit.pose_formats import NamedPose, check_formats, pose_files
 from posekit.results import Estimate
 
 SMALL = 40  # pixels, longer side of an object's box below which that is said
@@ -118,6 +120,7 @@ class Destination:
             if not Path(json).parent.is_dir():
                 raise OutputError(f"--json {json}: there is no folder {Path(json).parent}. Make it first.")
             _check_writable(Path(json).parent, f"--json {json} cannot be written")
+        check_formats(formats)
         if out is None and json is not None:
             if set(formats) - {"json"}:
                 raise OutputError(f"--format {formats[0]} with --json writes into a folder: pass --out DIR too.")
@@ -201,7 +204,15 @@ def describe(estimate: Estimate) -> str:
         f"{estimate.model}: {typer.style(estimate.verdict, fg=colour, bold=True)}\n"
         f"    score {estimate.score:.2f}, {steps}, {estimate.timings['total']:.1f} s\n"
         f"    T_cam_obj (metres)\n{rows}"
+        + "".join(f"\n    {_alternative(k, estimate)}" for k in range(len(estimate.alternatives)))
     )
+
+
+def _alternative(k: int, estimate: Estimate) -> str:
+    """The k-th alternative, how it differs, in a line; its matrix is in result.json."""
+    other = estimate.alternatives[k]
+    turn = math.degrees(rotation_angle(other.T_cam_obj.R.T @ estimate.T_cam_obj.R))
+    return f"alternative {k + 2}: turned by {turn:.0f} degrees, score {other.score:.2f}; {other.verdict}"
 
 
 def named_pose(estimate: Estimate, frame: int = 0, seconds: float | None = None) -> NamedPose:

@@ -102,7 +102,9 @@ def track(
 ) -> None:
     """Follow objects through a video: poses as they come, and an overlay to look at."""
     from posekit.cli.output import OutputFolder
-    from posekit.pose_formats import pose_files
+    from posekit.pose_formats import check_formats, pose_files
+
+    check_formats(format_ or ())
 
     folder = OutputFolder.chosen(out, Path("posekit-out") / f"{Path(source).stem or 'camera'}-track", force)
 
