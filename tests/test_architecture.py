@@ -15,7 +15,7 @@ SOURCE = Path(__file__).resolve().parent.parent / "src" / "posekit"
 # Rooms that are planned stand here too; a room that is built must stand here.
 LAYERS = {
     0: {"geometry", "camera", "files", "lens", "polygons", "pixels", "mesh_files"},
-    1: {"view", "object_model", "results"},
+    1: {"view", "object_model", "results", "pose_formats"},
     2: {"load", "calibration", "zoom", "metrics", "pnp", "fusion", "render", "nets", "detect", "draw", "evidence"},
     3: {
         "data",
@@ -33,8 +33,9 @@ LAYERS = {
     },
     4: {"estimate", "novel"},
     5: {"search", "track", "evaluate", "train"},
-    6: {"cli"},
-    7: {"__main__"},
+    6: {"api"},
+    7: {"cli"},
+    8: {"__main__"},
 }
 ANYWHERE = {"errors", "_version"}
 # Fusion weighs what PnP alone solves. A camera turns rays; tracking and the search for instances are measured too.

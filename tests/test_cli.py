@@ -11,6 +11,7 @@ import sys
 import time
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -20,10 +21,14 @@ import torch
 from typer.main import get_command
 from typer.testing import CliRunner, Result
 
-from posekit import __version__
+from posekit import __version__, results
+from posekit.camera import Camera
 from posekit.cli import doctor
 from posekit.cli.app import app
+from posekit.cli.output import limits
 from posekit.data.example import Example, make_example, ply
+from posekit.geometry import Pose, rotation_angle
+from posekit.load import load_pose
 from posekit.nets.weights import build, save_networks
 from posekit.render import Renderer
 
@@ -142,8 +147,24 @@ def test_estimate_writes_a_result_and_an_overlay(invoke: Invoke, tmp_path: Path)
     assert sorted(path.name for path in out.iterdir()) == ["overlay.png", "result.json"]
     assert_result((out / "result.json").read_text())
     overlay = cv2.imread(str(out / "overlay.png"))
-    assert overlay.shape[1] == 640
-    assert overlay.shape[0] > 480
+    assert overlay.shape[1] > 640 and overlay.shape[0] > 480
+
+
+@pytest.mark.parametrize("command", ["estimate", "refine"])
+@pytest.mark.parametrize("least", [0.0, 2.0])
+def test_what_is_not_reliable_says_so_first(
+    invoke: Invoke, monkeypatch: pytest.MonkeyPatch, command: str, least: float
+) -> None:
+    monkeypatch.setattr(results, "RELIABLE_SCORE", least)
+    monkeypatch.setattr(results, "RELIABLE_ANGLE_DEG", 180.0)
+    found = invoke(command, None, "--require-reliable", json="-")
+    reliable = least == 0.0
+    assert found.exit_code == (0 if reliable else 3), found.output
+    assert json.loads(found.stdout)["estimates"][0]["reliable"] is reliable, "written all the same"
+    first = next(line for line in found.stderr.splitlines() if line.startswith("toy: "))
+    assert first.startswith("toy: reliable:" if reliable else "toy: NOT RELIABLE:")
+    assert "converged" not in found.stderr
+    assert invoke(command, json="-").exit_code == 0, "it has to be asked for"
 
 
 def test_json_on_standard_output_is_alone_there(invoke: Invoke, tmp_path: Path) -> None:
@@ -213,14 +234,92 @@ def test_refine_takes_what_estimate_wrote(invoke: Invoke, tmp_path: Path) -> Non
     assert_result((tmp_path / "posekit-out" / "photo-refined" / "result.json").read_text())
 
 
-def test_render_views(invoke: Invoke, tmp_path: Path) -> None:
+def test_what_the_mesh_and_the_picture_do_not_allow_is_said_once(example: Example) -> None:
+    plain = replace(example.model, colors=None)
+    near = results.Estimate(example.T_cam_obj, 0.1, 1, True, 0.9, (10.0, 10.0, 50.0, 30.0), "toy")
+    far = replace(near, box=(10.0, 10.0, 33.0, 49.0))
+    assert limits(example.model, [near]) == []
+    assert limits(plain, []) == [], "nothing was found, so nothing is uncertain"
+    [colours] = limits(plain, [near, near])
+    assert "has no colours" in colours
+    [size] = limits(example.model, [near, far, far])
+    assert "only 39 pixels large 2 of 3 times" in size
+
+
+def test_a_mesh_without_colours_is_told_of(invoke: Invoke, example: Example, tmp_path: Path) -> None:
+    (tmp_path / "grey.ply").write_text(ply(replace(example.model, colors=np.zeros_like(example.model.vertices, "u1"))))
+    lines = [
+        line
+        for line in (tmp_path / "grey.ply").read_text().splitlines()
+        if not line.startswith(("property uchar red", "property uchar green", "property uchar blue"))
+    ]
+    (tmp_path / "grey.ply").write_text("\n".join(line.removesuffix(" 0 0 0") for line in lines) + "\n")
+    found = invoke("refine", model=tmp_path / "grey.ply", units="m", json="-")
+    assert found.exit_code == 0, found.output
+    assert found.stderr.count("has no colours") == 1
+    assert "has no colours" not in invoke("refine", json="-").stderr
+
+
+def test_top_keeps_other_poses(invoke: Invoke) -> None:
+    found = invoke("estimate", top=3, json="-")
+    assert found.exit_code == 0, found.output
+    [entry] = json.loads(found.stdout)["estimates"]
+    assert len(entry["alternatives"]) == 2
+    poses = [Pose.from_matrix(e["T_cam_obj"]) for e in (entry, *entry["alternatives"])]
+    for k, pose in enumerate(poses):
+        assert all(rotation_angle(pose.R.T @ other.R) > np.deg2rad(9) for other in poses[:k])
+    assert "alternative 3: turned by" in found.stderr
+    assert_fails(invoke("estimate", top=9), "top 9", "--hypotheses")
+    assert json.loads(invoke("estimate", json="-").stdout)["estimates"][0]["alternatives"] == []
+
+
+def test_running_a_line_again_writes_beside_the_first_result(invoke: Invoke, tmp_path: Path) -> None:
+    for number in ("", "-2", "-3"):
+        found = invoke("render-views", None, views=1, size="16x16", units="m")
+        assert found.exit_code == 0, found.output
+        assert str(Path(f"posekit-out{number}/toy-views/contact_sheet.png")) in found.stdout
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["posekit-out", "posekit-out-2", "posekit-out-3"]
+    assert invoke("render-views", None, "--force", views=1, size="16x16", units="m").exit_code == 0
+    assert len(list(tmp_path.iterdir())) == 3, "--force writes into the first"
+
+
+def test_formats_for_other_programs(invoke: Invoke, folder: Path, tmp_path: Path) -> None:
+    flags = [word for name in ("csv", "ros", "blender", "unity", "tum", "json") for word in ("--format", name)]
+    found = invoke("refine", None, *flags, out="out")
+    assert found.exit_code == 0, found.output
+    names = {"objects.csv", "ros.yaml", "blender.json", "unity.json", "toy.tum", "result.json", "overlay.png"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == names
+    matrix = json.loads((tmp_path / "out/result.json").read_text())["estimates"][0]["T_cam_obj"]
+    np.testing.assert_allclose(load_pose(tmp_path / "out/toy.tum").matrix, matrix, atol=1e-9)
+    assert invoke("refine", pose=tmp_path / "out/toy.tum", json="-").exit_code == 0
+    assert_fails(invoke("refine", None, "--format", "csv", json="-"), "--format csv", "--out")
+    assert_fails(invoke("refine", None, "--format", "xml"), "--format xml", "blender")
+
+
+def test_an_estimate_can_be_made_twice(invoke: Invoke, tmp_path: Path) -> None:
+    assert [invoke("estimate").exit_code for _ in range(2)] == [0, 0]
+    first, second = (tmp_path / name / "photo" / "result.json" for name in ("posekit-out", "posekit-out-2"))
+    assert_result(first.read_text())
+    assert_result(second.read_text())
+
+
+def test_render_views(invoke: Invoke, example: Example, tmp_path: Path) -> None:
     result = invoke("render-views", None, views=6, size="64x48", out="views", units="m")
     assert result.exit_code == 0, result.output
     names = sorted(path.name for path in (tmp_path / "views").iterdir())
-    assert names == sorted([f"{k:04d}{end}.png" for k in range(6) for end in ("", "_mask")] + ["contact_sheet.png"])
+    assert names == sorted(
+        [f"{k:04d}{end}.png" for k in range(6) for end in ("", "_mask")] + ["contact_sheet.png", "views.json"]
+    )
     mask = cv2.imread(str(tmp_path / "views/0000_mask.png"), cv2.IMREAD_UNCHANGED)
     assert mask.shape == (48, 64)
     assert 0.05 < (mask > 0).mean() < 0.8
+    about = json.loads((tmp_path / "views" / "views.json").read_text())
+    (fx, _, cx), (_, fy, cy), _ = about["camera"]["K"]
+    camera = Camera(fx, fy, cx, cy, about["camera"]["width"], about["camera"]["height"])
+    pose = Pose.from_matrix(about["views"][0]["T_cam_obj"])
+    [drawn] = Renderer().render(example.model, [pose], camera)
+    assert about["views"][0]["mask"] == "0000_mask.png"
+    np.testing.assert_array_equal(drawn.mask, mask > 0)
 
 
 def test_demo(invoke: Invoke, folder: Path, tmp_path: Path) -> None:
@@ -231,7 +330,7 @@ def test_demo(invoke: Invoke, folder: Path, tmp_path: Path) -> None:
     assert "T_cam_obj" in result.stdout
     assert str(Path("posekit-out/demo/overlay.png")) in result.stdout
     assert (tmp_path / "posekit-out/demo/overlay.png").stat().st_size > 10_000
-    assert_fails(CliRunner().invoke(app, arguments), "--force")
+    assert_fails(CliRunner().invoke(app, [*arguments, "--out", "posekit-out/demo"]), "--force")
 
 
 def test_doctor_reports_every_part(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from posekit import draw
 from posekit.camera import Camera
+from posekit.draw import WHITE
 from posekit.geometry import Pose
 
 CAMERA = Camera(500.0, 500.0, 79.5, 59.5, 160, 120)
@@ -32,6 +33,70 @@ def test_contour_follows_the_mask_and_leaves_its_inside(image: draw.Image) -> No
         assert tuple(drawn[row, column]) == (90, 90, 90)
 
 
+def test_a_contour_is_the_masks_outermost_pixels_and_no_other(image: draw.Image) -> None:
+    mask = cv2.circle(np.zeros((120, 160), np.uint8), (70, 60), 31, 1, -1) > 0
+    drawn = draw.contour(image, mask, (0, 255, 0))
+    green = (drawn == (0, 255, 0)).all(axis=-1)
+    edge = mask & ~(cv2.erode(mask.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))) > 0)
+    np.testing.assert_array_equal(green, edge)
+    assert (drawn[mask & ~edge] == 90).all(), "the inside is as it was"
+    rim = (cv2.dilate(mask.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))) > 0) & ~mask
+    assert (drawn[rim] == 36).all()
+    assert (drawn[~mask & ~rim] == 90).all()
+
+
+def test_a_finer_mask_smooths_the_contour_and_does_not_move_or_widen_it(image: draw.Image) -> None:
+    fine = 8
+    rows, columns = (np.indices((60 * fine, 80 * fine)) + 0.5) / fine - 0.5  # pixel centres of the part from (20, 10)
+    radius = np.hypot(rows + 10 - 40.3, columns + 20 - 61.7)
+    drawn = draw.contour(np.zeros_like(image), radius < 21.0, WHITE, fine=fine, corner=(20, 10)).astype(float)[..., 0]
+    share = drawn / 255
+    assert share.sum() == pytest.approx(2 * np.pi * 20.5, rel=0.03), "one pixel wide"
+    y, x = np.indices(share.shape)
+    away = np.hypot(y - 40.3, x - 61.7)
+    assert (share * away).sum() / share.sum() == pytest.approx(20.5, abs=0.1), "from the edge one pixel inwards"
+    assert share[(away > 20) & (away < 21)].min() > 0.2, "no gaps"
+    assert (share > 0).sum() > 1.5 * (share > 0.8).sum(), "smooth"
+
+
+@pytest.mark.parametrize("ground", [(0, 0, 0), (255, 255, 255), draw.GREEN, draw.RED, (128, 128, 128)])
+def test_a_contour_shows_on_any_ground(ground: draw.Colour) -> None:
+    mask = np.zeros((40, 40), np.bool_)
+    mask[10:30, 10:30] = True
+    drawn = draw.contour(np.full((40, 40, 3), ground, np.uint8), mask).astype(float)
+    line, rim, beside = drawn[20, 10], drawn[20, 9], drawn[20, 5]
+    assert max(np.abs(line - beside).max(), np.abs(line - rim).max()) > 120
+
+
+def test_blend_mixes_inside_the_mask_only(image: draw.Image) -> None:
+    mask = np.zeros((120, 160), np.bool_)
+    mask[:60] = True
+    mixed = draw.blend(image, np.full_like(image, 190), mask, 0.25)
+    assert (mixed[:60] == 115).all()
+    assert (mixed[60:] == 90).all()
+
+
+def test_lines_of_text_fit_their_width() -> None:
+    drawn = draw.lines(["duck", "a very long line that would never fit " * 3], 200)
+    assert drawn.shape == (2 * draw.LINE + 4, 200, 3)
+    assert [(row > 120).any() for row in np.split(drawn[: 2 * draw.LINE], 2)] == [True, True]
+    assert (drawn[:, 198:] == draw.PAPER).all()
+
+
+def test_a_label_stays_in_the_picture(image: draw.Image) -> None:
+    for corner in [(-50.0, -50.0), (500.0, 500.0), (80.0, 60.0)]:
+        drawn = draw.label(image, "duck", corner)
+        assert (drawn > 200).any()
+        assert 20 < (drawn != 90).any(axis=-1).sum() < 1500
+
+
+def test_tiles_beside_a_picture_fill_columns(image: draw.Image) -> None:
+    sheet = draw.beside(image, [np.full((50, 50, 3), k, np.uint8) for k in (1, 2, 3)], gap=2)
+    assert sheet.shape == (120, 160 + 2 * 52, 3)
+    assert [int(sheet[y, x, 0]) for y, x in ((10, 170), (60, 170), (10, 220))] == [1, 2, 3]
+    assert (sheet[:, :160] == image).all()
+
+
 def test_contour_of_nothing_changes_nothing(image: draw.Image) -> None:
     assert (draw.contour(image, np.zeros((120, 160), dtype=np.bool_)) == image).all()
 
@@ -41,6 +106,12 @@ def test_axes_point_where_the_camera_sees_them(image: draw.Image) -> None:
     assert tuple(drawn[60, 100]) == draw.AXES[0]  # x to the right
     assert tuple(drawn[85, 80]) == draw.AXES[1]  # y down
     assert (image == 90).all()
+
+
+def test_axes_carry_their_letters(image: draw.Image) -> None:
+    drawn = draw.axes(image, CAMERA, Pose.translation([0, 0, 1.0]), 0.08)
+    for letter, colour in ((drawn[50:70, 123:136], draw.AXES[0]), (drawn[103:118, 70:90], draw.AXES[1])):
+        assert (np.abs(letter.astype(int) - colour).max(axis=-1) < 60).sum() > 4
 
 
 def test_axes_behind_the_camera_are_left_out(image: draw.Image) -> None:

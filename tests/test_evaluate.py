@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -516,3 +517,21 @@ def test_the_interval_covers_a_known_difference(tmp_path: Path) -> None:
     assert (found.high - found.low) / 2 == pytest.approx(1.96 * error, rel=0.1)
     with pytest.raises(InputError, match="cannot be read"):
         compare(folders[0], tmp_path / "none")
+
+
+def test_a_tile_shows_truth_and_estimate_side_by_side() -> None:
+    from posekit import draw
+    from posekit.data.example import make_example
+    from posekit.evaluate.report import tile
+    from posekit.render import Renderer
+
+    renderer = Renderer()
+    example = make_example(renderer)
+    data = SimpleNamespace(view=lambda *_: example.view, model=lambda *_: example.model)
+    case = SimpleNamespace(scene=0, image=0, obj_id=1, T_cam_obj=example.T_cam_obj)
+    picture = tile(case, case, data, renderer)  # type: ignore[arg-type]
+    left, right = picture[:, :240], picture[:, -240:]
+    alone = tile(case, None, data, renderer)  # type: ignore[arg-type]
+    for half, colour, other in ((left, draw.ORANGE, draw.GREEN), (right, draw.GREEN, draw.ORANGE)):
+        assert (half == colour).all(axis=-1).sum() > 30 > 5 > (half == other).all(axis=-1).sum()
+    assert (alone[:, :240] == left).all() and (alone[:, -240:] != right).any()

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
-from posekit import figures
+from posekit import draw, figures
 from posekit.camera import Camera, mask_box
 from posekit.data.example import Example, locomotive, make_example, ply
 from posekit.geometry import Pose
@@ -77,20 +79,67 @@ def estimate(example: Example, steps: int) -> Estimate:
 
 
 @pytest.mark.parametrize("steps", [0, 1, 3, 50])
-def test_overlay_shows_the_photograph_and_a_strip(example: Example, renderer: Renderer, steps: int) -> None:
-    picture = figures.overlay(renderer, example.model, example.view, [estimate(example, steps)])
+def test_overlay_shows_photograph_enlarged_crop_and_strip(example: Example, renderer: Renderer, steps: int) -> None:
+    picture = figures.overlay(renderer, example.view, [(example.model, estimate(example, steps))])
     assert picture.dtype == np.uint8
-    assert picture.shape[1] == 640
+    assert picture.shape[1] == 640 + 4 + 480
     assert picture.shape[0] > 480 + 60
-    changed = (picture[:480] != example.view.image).any(axis=2)
+    changed = (picture[:480, :640] != example.view.image).any(axis=2)
     assert 0.005 < changed.mean() < 0.1
     x0, y0, x1, y1 = (int(v) for v in example.box)
     changed[y0 - 80 : y1 + 80, x0 - 80 : x1 + 80] = False
     assert not changed.any()
 
 
+def test_the_outline_lies_on_the_silhouettes_edge_to_the_pixel(example: Example, renderer: Renderer) -> None:
+    camera, fine = example.view.camera, 8
+    [drawn] = renderer.render(example.model, [example.T_cam_obj], camera.resized(fine * 640, fine * 480))
+    assert drawn.mask is not None
+    covered = drawn.mask.reshape(480, fine, 640, fine).mean(axis=(1, 3))
+    grey = np.full_like(example.view.image, 100)
+    drawn_line = figures.outlined(renderer, grey, camera, example.model, example.T_cam_obj, (255, 255, 255))
+    line = drawn_line[..., 0].astype(float)
+    around, cross = np.ones((5, 5)), cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+    inside = cv2.erode((covered == 1).astype(np.uint8), around) > 0
+    outside = cv2.dilate((covered > 0).astype(np.uint8), around) == 0
+    assert (line[inside] == 100).all() and (line[outside] == 100).all(), "nothing beyond two pixels of the edge"
+    assert (line[covered == 0] <= 100).all(), "the line lies on the object's own outermost pixels"
+    edge = (covered > 0.7) & (cv2.erode((covered > 0.7).astype(np.uint8), cross) == 0)
+    assert (line[edge] > 130).mean() > 0.95, "without gaps"
+
+
+def test_the_outline_of_what_lies_partly_or_wholly_outside(example: Example, renderer: Renderer) -> None:
+    for shift, seen in (([-0.17, 0, 0], True), ([5.0, 0, 0], False), ([0, 0, -5.0], False)):
+        pose = Pose(example.T_cam_obj.R, example.T_cam_obj.t + shift)
+        drawn = figures.outlined(renderer, example.view.image, example.view.camera, example.model, pose)
+        assert (drawn != example.view.image).any() == seen
+
+
+def test_what_is_not_reliable_is_red(example: Example, renderer: Renderer) -> None:
+    good = estimate(example, 1)
+    pictures = [
+        figures.overlay(renderer, example.view, [(example.model, each)])[:480, :640]
+        for each in (good, replace(good, score=0.1))
+    ]
+    counts = [[int((p == c).all(axis=-1).sum()) for c in (draw.GREEN, draw.RED)] for p in pictures]
+    assert counts[0][0] > 50 > 5 > counts[0][1]
+    assert counts[1][1] > 50 > 5 > counts[1][0]
+
+
+def test_several_objects_are_in_one_picture_and_blended_in_at_choice(example: Example, renderer: Renderer) -> None:
+    good = estimate(example, 0)
+    other = replace(good, T_cam_obj=Pose(good.T_cam_obj.R, good.T_cam_obj.t + [-0.17, 0, 0]))
+    results = [(example.model, good), (example.model, other)]
+    one, two, blended = (
+        figures.overlay(renderer, example.view, chosen, share)[:480, :640]
+        for chosen, share in ((results[:1], 0.0), (results, 0.0), (results, 1.0))
+    )
+    assert (one != two).any(axis=-1).sum() > 300
+    assert np.abs(two[:, :200].astype(int) - blended[:, :200]).max() > 50, "the second one's render shows"
+
+
 def test_overlay_of_nothing_is_the_photograph(example: Example, renderer: Renderer) -> None:
-    np.testing.assert_array_equal(figures.overlay(renderer, example.model, example.view, []), example.view.image)
+    np.testing.assert_array_equal(figures.overlay(renderer, example.view, []), example.view.image)
 
 
 @pytest.mark.parametrize(
@@ -102,6 +151,6 @@ def test_overlays_suit_a_screen(
     camera = Camera.from_fov(0.9, *size)
     view = View(np.full((size[1], size[0], 3), 90, np.uint8), camera)
     found = Estimate(Pose.translation([0, 0, 0.8]), 0.01, 1, True, 0.9, (0, 0, *size), "locomotive")
-    picture = figures.overlay(renderer, example.model, view, [found])
+    picture = figures.overlay(renderer, view, [(example.model, found)])
     assert picture.shape[0] > shown[1]
-    assert picture.shape[1] == max(640, shown[0])
+    assert shown[0] + 236 < picture.shape[1] <= shown[0] + 484

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import stat
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,17 @@ from posekit.errors import OutputError, PromptError
 from posekit.files import write_bytes_atomic, write_text_atomic
 from posekit.geometry import Pose, random_rotation
 from posekit.load import load_pose
-from posekit.results import Detection, Estimate, Source, Step, estimate_to_json, estimates_from_json, estimates_to_json
+from posekit.results import (
+    RELIABLE_ANGLE_DEG,
+    RELIABLE_SCORE,
+    Detection,
+    Estimate,
+    Source,
+    Step,
+    estimate_to_json,
+    estimates_from_json,
+    estimates_to_json,
+)
 
 POSE = Pose(random_rotation(np.random.default_rng(0)), [0.1, -0.2, 0.9])
 
@@ -33,6 +44,26 @@ def estimate(angle: float = 0.02) -> Estimate:
         trace=(Step(Pose.identity(), 0.4), Step(POSE, angle)),
         timings={"refine": 0.25, "total": 0.5},
     )
+
+
+@pytest.mark.parametrize(
+    ("angle_deg", "score", "words"),
+    [
+        (2.2, 0.9, "reliable: expected rotation error about 2 degrees"),
+        (RELIABLE_ANGLE_DEG - 0.1, RELIABLE_SCORE, "reliable: expected rotation error about 15 degrees"),
+        (0.4, 0.9, "reliable: expected rotation error below 1 degree"),
+        (1.2, 0.9, "reliable: expected rotation error about 1 degree"),
+        (23.8, 0.9, "NOT RELIABLE: estimated rotation error about 24 degrees"),
+        (2.2, 0.1, "NOT RELIABLE: the picture hardly shows this object in this pose; estimated rotation error about 2"),
+        (float("nan"), 0.9, "NOT RELIABLE: estimated rotation error unknown"),
+    ],
+)
+def test_a_verdict_needs_both_score_and_angle(angle_deg: float, score: float, words: str) -> None:
+    found = replace(estimate(float(np.deg2rad(angle_deg))), score=score)
+    assert found.reliable == words.startswith("reliable")
+    assert found.verdict.startswith(words)
+    assert found.angle_deg == pytest.approx(angle_deg, nan_ok=True)
+    assert json.loads(estimate_to_json(found))["estimates"][0]["reliable"] is found.reliable
 
 
 def no_constant(name: str) -> float:
@@ -68,6 +99,17 @@ def test_round_trip() -> None:
     assert json.loads(text)["image"] == "a.png"
     assert json.loads(text)["K"] == np.eye(3).tolist()
     assert estimates_from_json(estimates_to_json([])) == []
+
+
+def test_alternatives_are_kept() -> None:
+    found = replace(estimate(), alternatives=(estimate(0.3), replace(estimate(0.4), score=0.1)))
+    [back] = estimates_from_json(estimate_to_json(found))
+    assert [(e.angle, e.score) for e in back.alternatives] == [pytest.approx((0.3, 0.8)), pytest.approx((0.4, 0.1))]
+    entry = json.loads(estimate_to_json(found))["estimates"][0]
+    assert [e["reliable"] for e in entry["alternatives"]] == [False, False]
+    del entry["alternatives"]
+    [old] = estimates_from_json(json.dumps({"estimates": [entry]}))
+    assert old.alternatives == (), "files from before"
 
 
 def test_what_is_not_finite_is_null() -> None:
@@ -111,7 +153,8 @@ def test_bop_rotations_that_are_a_little_too_large(tmp_path: Path) -> None:
     ("text", "why"),
     [
         ("{", "holds no pose"),
-        ("[1, 2]", "outermost"),
+        ("[1, 2]", "it has 2 numbers"),
+        ("[{}]", "outermost"),
         ("{}", "has no cam_R_m2c"),
         ('{"T_cam_obj": [[1, 2], [3, 4]]}', r"shape \(4, 4\)"),
         (json.dumps({"T_cam_obj": np.zeros((4, 4)).tolist()}), "not a rotation"),

@@ -13,7 +13,7 @@ from posekit.camera import Box, mask_box
 from posekit.contour import fit_contour
 from posekit.errors import ConfigError
 from posekit.features import FeatureSearch
-from posekit.geometry import Pose
+from posekit.geometry import Pose, rotation_angle
 from posekit.hypotheses import (
     Agreement,
     BoxSearch,
@@ -27,7 +27,6 @@ from posekit.nets.predictor import NetworkPredictor
 from posekit.nets.weights import Networks, load_networks
 from posekit.object_model import ObjectModel
 from posekit.refine import Refinement, RefineOptions, compare, predicted_angle, refine, update_pose
-from posekit.region import fit_outline
 from posekit.render import Renderer
 from posekit.results import Branch, Detection, Estimate
 from posekit.view import View
@@ -38,17 +37,17 @@ SILHOUETTE, STRUCTURE, BLUR, BIAS = 4.1, 8.0, 3.0, -2.3  # of `presence`, fitted
 USUAL = 2.0  # pixels of the crop: the correspondences' expected error, where the network gives none
 FIRST, SEMIFINALISTS, HEATS, FINALISTS = 1, 4, 3, 2  # iterations after which only so many hypotheses go on
 DOUBT = 0.3  # evidence that outweighs a radian of predicted angle
+DIFFERENT = float(np.deg2rad(10.0))  # turn, or shift in diameters, from which an alternative is another pose
 BESIDE = float(np.deg2rad(12.0))  # how far from a known pose others are tried
 
 
 @dataclass(frozen=True)
 class EstimateOptions:
     """init: where first poses come from. hypotheses: how many of them are refined, for each of a detection's masks.
-    beside: whether poses beside a known
-    one are tried too where it does not converge at once. contour: whether the pose is laid onto the mask's outline
-    where the mask proves exact. outline: whether it is laid onto the one that the photograph's colours show where there
-    is no such mask. update: what moves the pose, one of
-    RefineOptions' or AUTO. The rest is RefineOptions', with the angle in degrees."""
+    update: what moves the pose, one of RefineOptions' or AUTO. beside: whether poses beside a known one are tried too
+    where it does not converge at once. contour: whether the pose is laid onto the mask's outline where the mask proves
+    exact. outline: whether refinement weighs the outline that the photograph's colours show. top: poses that an
+    estimate keeps, itself and alternatives. The rest is RefineOptions', with the angle in degrees."""
 
     init: str = "templates"
     hypotheses: int = 5
@@ -59,18 +58,22 @@ class EstimateOptions:
     beside: bool = True
     contour: bool = True
     outline: bool = True
+    top: int = 1
 
     def __post_init__(self) -> None:
         if self.init not in INITS:
             raise ConfigError(f"init is one of {INITS}, not {self.init!r}.")
         if self.hypotheses < 1:
             raise ConfigError(f"at least 1 hypothesis is needed, not {self.hypotheses}.")
+        if not 1 <= self.top <= self.hypotheses:
+            raise ConfigError(f"top {self.top}: from 1 to {self.hypotheses}, the number of hypotheses.")
         _ = self.refine_options(True)  # checks the rest
 
     def refine_options(self, dense: bool) -> RefineOptions:
         """dense: whether the network gives correspondences."""
         update = ("correspondence" if dense else "regression") if self.update == AUTO else self.update
-        return RefineOptions(update, self.stop, self.iterations, float(np.deg2rad(self.stop_angle_deg)))
+        stop_angle = float(np.deg2rad(self.stop_angle_deg))
+        return RefineOptions(update, self.stop, self.iterations, stop_angle, outline=self.outline)
 
 
 class PoseEstimator:
@@ -130,7 +133,6 @@ class PoseEstimator:
             heats = self._heats(view, [T_cam_obj])
             if not heats[0].converged:
                 heats += self._heats(view, poses_beside(T_cam_obj, self.model, BESIDE))
-            heats = self._on_outline(view, heats)
             refined = self._finals(view, judge, heats)
         else:
             refined = refine(view, self.model, [T_cam_obj], self.predictor, self.renderer, options)
@@ -143,8 +145,8 @@ class PoseEstimator:
         options = self.refine_options
         if len(starts) <= FINALISTS or options.iterations <= HEATS:
             return refine(view, self.model, starts, self.predictor, self.renderer, options)
-        heats = self._best(judge, self._on_outline(view, self._heats(view, starts, FIRST)), SEMIFINALISTS)
-        heats = self._on_outline(view, self._onward(view, heats, HEATS - FIRST))
+        heats = self._best(judge, self._heats(view, starts, FIRST), max(SEMIFINALISTS, self.options.top))
+        heats = self._onward(view, heats, HEATS - FIRST)
         if least > 0 and self._last_look(view, self._best(judge, heats, 1)[0].T_cam_obj)[0] < least:
             return heats
         return self._finals(view, judge, heats)
@@ -155,7 +157,7 @@ class PoseEstimator:
 
     def _finals(self, view: View, judge: Judge, heats: Sequence[Refinement]) -> list[Refinement]:
         """The best go on to the end."""
-        finalists = self._best(judge, heats, FINALISTS)
+        finalists = self._best(judge, heats, max(FINALISTS, self.options.top))
         return self._onward(view, finalists, self.refine_options.iterations - HEATS)
 
     def _best(self, judge: Judge, heats: Sequence[Refinement], count: int) -> list[Refinement]:
@@ -193,8 +195,24 @@ class PoseEstimator:
         detection: Detection | None,
         timings: dict[str, float],
     ) -> Estimate:
-        """The hypothesis with the best score: much evidence in the photograph, and a low predicted angle."""
-        best, contour_std = self._on_contour(view, self._best(judge, refined, 1)[0])
+        """The hypothesis with the best score: much evidence in the photograph, and a low predicted angle. The next best
+        ones that differ from it and from each other are its alternatives."""
+        first, *others = self._best(judge, refined, len(refined) if self.options.top > 1 else 1)
+        kept = [self._estimate_of(view, first, detection, timings)]
+        for other in others:
+            if len(kept) < self.options.top and all(self._differ(other.T_cam_obj, k.T_cam_obj) for k in kept):
+                kept.append(self._estimate_of(view, other, detection, timings))
+        return replace(kept[0], alternatives=tuple(kept[1:]))
+
+    def _differ(self, a: Pose, b: Pose) -> bool:
+        """Whether two ``T_cam_obj`` are more than one pose that refinement ended in by two ways."""
+        moved = a.apply(self.model.center) - b.apply(self.model.center)
+        return bool(rotation_angle(a.R.T @ b.R) > DIFFERENT or np.linalg.norm(moved) > DIFFERENT * self.model.diameter)
+
+    def _estimate_of(
+        self, view: View, refined: Refinement, detection: Detection | None, timings: dict[str, float]
+    ) -> Estimate:
+        best, contour_std = self._on_contour(view, refined)
         presence, angle = self._last_look(view, best.T_cam_obj)
         return Estimate(
             T_cam_obj=best.T_cam_obj,
@@ -212,21 +230,13 @@ class PoseEstimator:
         )
 
     def _on_contour(self, view: View, refined: Refinement) -> tuple[Refinement, float | None]:
-        """With its outline on the mask's, where there is an exact one, and the fit's standard deviation. Else on the
-        one that the colours show, and None."""
+        """With its outline on the mask's, where there is an exact one, and the fit's standard deviation; else as it is,
+        and None."""
         if self.options.contour and view.mask is not None:
             fit = fit_contour(view, self.model, refined.T_cam_obj, self.renderer)
             if fit is not None and fit.exact:
                 return replace(refined, T_cam_obj=fit.T_cam_obj), fit.turn_std
-        return self._on_outline(view, [refined])[0], None
-
-    def _on_outline(self, view: View, refined: Sequence[Refinement]) -> list[Refinement]:
-        """Each with its outline where the photograph's colours change; as it is where these do not tell."""
-        if not self.options.outline:
-            return list(refined)
-        size = self.predictor.size
-        poses = [fit_outline(view, self.model, r.T_cam_obj, self.renderer, size, r.angle) for r in refined]
-        return [r if pose is None else replace(r, T_cam_obj=pose) for r, pose in zip(refined, poses, strict=True)]
+        return refined, None
 
     def _last_look(self, view: View, T_cam_obj: Pose) -> tuple[float, float]:
         """How sure it is that the photograph shows the object there, by what the network sees of it; and the rotation

@@ -20,6 +20,7 @@ from posekit.camera import Box, Camera
 from posekit.errors import CameraError, ImageError, InputError, PromptError
 from posekit.geometry import Pose, nearest_rotation
 from posekit.pixels import deep_colour, eight_bit, upright
+from posekit.pose_formats import pose_from_mapping, pose_from_text
 from posekit.view import View
 
 log = logging.getLogger("posekit")
@@ -28,6 +29,7 @@ Size = tuple[int, int]
 
 ASSUMED_FOV = math.radians(60.0)  # of the longer side, where nothing says what the camera was
 SMALLEST_SIDE = 16
+FAR = 50.0  # metres: a given pose beyond them is probably in other units
 MOST_PIXELS = 100_000_000
 
 _FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
@@ -274,35 +276,42 @@ def load_camera(source: str | Path, size: Size, image: str | Path | None = None)
 
 
 def load_pose(path: str | Path) -> Pose:
-    """``T_cam_obj`` (metres) from a JSON file.
+    """``T_cam_obj`` (metres) from a JSON or text file.
 
-    Read are ``{"T_cam_obj": 4x4}`` in metres, a posekit result (its first estimate), and BOP's ``cam_R_m2c`` with
-    ``cam_t_m2c`` in mm. Raises PromptError where the file is missing or something else.
+    JSON: ``{"T_cam_obj": 4x4}`` in metres, a posekit result (its first estimate), what
+    `posekit.pose_formats.pose_from_mapping` reads, and BOP's ``cam_R_m2c`` with ``cam_t_m2c`` in mm. Text: what
+    `posekit.pose_formats.pose_from_text` reads, a 4x4 matrix or x y z qx qy qz qw, metres. Raises PromptError where the
+    file is missing or something else.
     """
     path = Path(path)
     needed = (
-        'give {"T_cam_obj": 4x4 in metres}, a result.json of posekit, or BOP\'s {"cam_R_m2c": 9 numbers, '
-        '"cam_t_m2c": 3 numbers in mm}.'
+        'give {"T_cam_obj": 4x4 in metres}, a result.json of posekit, BOP\'s {"cam_R_m2c": 9 numbers, '
+        '"cam_t_m2c": 3 numbers in mm}, or a text file with a 4x4 matrix or x y z qx qy qz qw, in metres.'
     )
     try:
-        data = json.loads(path.read_text(encoding="utf-8-sig"))
-        if isinstance(data, dict) and "estimates" in data:
-            if not data["estimates"]:
-                raise PromptError(f"the result {path} has no estimates, so there is no pose to start from: {needed}")
-            data = data["estimates"][0]
-        return _pose_from_dict(data)
+        text = path.read_text(encoding="utf-8-sig")
+        pose = _pose_from_json(json.loads(text), path, needed) if "{" in text else pose_from_text(text)
     except OSError as error:
         raise PromptError(f"the pose file {path} cannot be read ({error.strerror}): check the path.") from error
     except (ValueError, KeyError, TypeError) as error:
         reason = f"it has no {error.args[0]}" if isinstance(error, KeyError) else str(error)
         raise PromptError(f"{path} holds no pose ({reason}): {needed}") from error
+    if float(np.linalg.norm(pose.t)) > FAR:
+        log.warning("%s puts the object %.0f m away: positions are in metres.", path.name, np.linalg.norm(pose.t))
+    return pose
 
 
-def _pose_from_dict(data: Any) -> Pose:
+def _pose_from_json(data: Any, path: Path, needed: str) -> Pose:
+    if isinstance(data, dict) and "estimates" in data:
+        if not data["estimates"]:
+            raise PromptError(f"the result {path} has no estimates, so there is no pose to start from: {needed}")
+        data = data["estimates"][0]
     if not isinstance(data, dict):
         raise ValueError("its outermost part is not {...}")
     if "T_cam_obj" in data:
         return Pose.from_matrix(data["T_cam_obj"])
+    if {"quat_wxyz", "position", "translation", "pose", "transform"} & set(data):
+        return pose_from_mapping(data)
     return pose_from_bop(data["cam_R_m2c"], data["cam_t_m2c"])
 
 

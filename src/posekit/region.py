@@ -14,12 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from posekit.fusion import Belief, Lines, fuse
-from posekit.geometry import Pose
-from posekit.object_model import ObjectModel
-from posekit.render import Renderer
+from posekit.fusion import Lines
 from posekit.view import View
-from posekit.zoom import zoom_to_pose
 
 Array = NDArray[np.float64]
 FArray = NDArray[np.float32]
@@ -38,9 +34,6 @@ BLUR = 1.0  # pixels over which neighbours decide together whose they are
 HUE = 0.12  # distance of chromaticities beyond which a pixel is not the mesh's
 SUDDEN, SMOOTH = 0.12, 1.0  # the same beyond what it has been before; pixels over which that is averaged
 HIDDEN, BESIDE = 2, 5  # pixels: how deep a hidden part is that no pose's error explains, and how far it spoils outlines
-STEPS, LEAST_SEEN = 2, 0.15  # of a fit; share of the silhouette with the mesh's hues below which they say nothing
-# of the pose that a fit starts from, for each radian that it is unsure: radians, pixels, shares of the distance
-SURE, TURN, SHIFT, DEPTH = 0.02, 1.0, 30.0, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,48 +139,6 @@ def outline_lines(
     columns, rows = pixels[usable].astype(int).T
     points = drawn.coords[rows, columns].astype(np.float64) - center
     return Lines(*(array.astype(np.float64) for array in (points, places[usable], normals[usable], sigma[usable])))
-
-
-def fit_outline(
-    view: View,
-    model: ObjectModel,
-    T_cam_obj: Pose,
-    renderer: Renderer,
-    size: tuple[int, int],
-    turn_std: float,
-    steps: int = STEPS,
-) -> Pose | None:
-    """The ``T_cam_obj`` whose outline lies where the photograph's colours change from the object's to its ground's.
-
-    Colours are learned from the pose's own silhouette, again at every step, where view.mask, or else the mesh's hues,
-    say that the object is seen. turn_std: how sure the given pose is, radians. size: (width, height) of the crops.
-    None where too little of the outline can be told.
-    """
-    outline, pose, colours = model.outline - model.center, T_cam_obj, None
-    prior: Belief | None = None
-    for _ in range(steps):
-        zoom = zoom_to_pose(view.camera, pose @ model.T_obj_ctr, outline, size)
-        shown = view.zoomed(zoom)
-        [drawn] = renderer.render(model, [Pose.rotation(zoom.R_view_cam) @ pose], [zoom.camera])
-        assert drawn.mask is not None
-        visible = like_mesh(shown, drawn) if shown.mask is None else shown.mask
-        if (visible & drawn.mask).sum() < LEAST_SEEN * drawn.mask.sum():
-            visible = np.ones_like(visible)
-        newer = learn(shown, drawn.mask, visible)
-        colours = newer if colours is None else colours.mixed(newer, 0.5)
-        lines = outline_lines(shown, drawn, colours, colours.seen(shown), model.center)
-        if lines is None:
-            return None
-        T_view_ctr = Pose.rotation(zoom.R_view_cam) @ pose @ model.T_obj_ctr
-        if prior is None:
-            spread = max(turn_std, SURE)
-            prior = Belief.about(T_view_ctr, zoom.camera, TURN * spread, SHIFT * spread, DEPTH * spread)
-            prior = prior.turned(zoom.R_view_cam.T)
-        found = fuse(T_view_ctr, [prior.turned(zoom.R_view_cam), lines], zoom.camera)
-        if found is None or found.pose.t[2] < 0.6 * model.diameter:
-            return None
-        pose = Pose.rotation(zoom.R_view_cam.T) @ found.pose @ model.T_obj_ctr.inverse()
-    return pose
 
 
 def find_outline(mask: Mask) -> Outline:

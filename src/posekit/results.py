@@ -18,6 +18,10 @@ from posekit.camera import Box
 from posekit.errors import PromptError
 from posekit.geometry import Pose
 
+# An estimate is reliable from this score on and up to this predicted rotation error (docs/conventions.md).
+RELIABLE_SCORE = 0.5
+RELIABLE_ANGLE_DEG = 15.0
+
 
 class Source(StrEnum):
     """Where a detection comes from."""
@@ -66,6 +70,11 @@ class Step:
     T_cam_obj: Pose
     angle: float
 
+    @property
+    def angle_deg(self) -> float:
+        """The predicted rotation error, degrees."""
+        return math.degrees(self.angle)
+
 
 class Branch(StrEnum):
     """Which of the poses in which a symmetric object looks the same was taken."""
@@ -85,6 +94,7 @@ class Estimate:
     else the angle, is below the threshold. branch: None for an object without symmetries. score: in [0, 1], how likely
     the object is there in this pose. box: of the object at this pose, edges, pixels. model: the mesh's name.
     detection: what it started from. trace: the poses on the way, first to last. timings: seconds by stage.
+    alternatives: other poses that were refined to the end, best first, where they were asked for.
     """
 
     T_cam_obj: Pose
@@ -99,6 +109,36 @@ class Estimate:
     timings: Mapping[str, float] = field(default_factory=dict)
     contour_std: float | None = None
     branch: Branch | None = None
+    alternatives: tuple[Estimate, ...] = ()
+
+    @property
+    def angle_deg(self) -> float:
+        """The predicted rotation error, degrees."""
+        return math.degrees(self.angle)
+
+    @property
+    def reliable(self) -> bool:
+        """Whether score and predicted rotation error say that the pose can be used; an angle that is NaN says no."""
+        return self.score >= RELIABLE_SCORE and self.angle_deg <= RELIABLE_ANGLE_DEG
+
+    @property
+    def verdict(self) -> str:
+        """Whether the estimate is reliable, in words, and how far it may be off."""
+        error = f"rotation error {angle_in_words(self.angle_deg)}"
+        if self.reliable:
+            return f"reliable: expected {error}"
+        if self.score >= RELIABLE_SCORE:
+            return f"NOT RELIABLE: estimated {error}"
+        return f"NOT RELIABLE: the picture hardly shows this object in this pose; estimated {error}"
+
+
+def angle_in_words(degrees: float) -> str:
+    """ "about 2 degrees", rounded as far as a predicted error is meaningful."""
+    if math.isnan(degrees):
+        return "unknown"
+    if degrees < 1:
+        return "below 1 degree"
+    return f"about {degrees:.0f} degree{'' if round(degrees) == 1 else 's'}"
 
 
 def estimates_to_json(
@@ -149,7 +189,8 @@ def _estimate_to_dict(estimate: Estimate) -> dict[str, Any]:
         "T_cam_obj": estimate.T_cam_obj.matrix.tolist(),
         "quat_wxyz": estimate.T_cam_obj.quat_wxyz.tolist(),
         "t_m": estimate.T_cam_obj.t.tolist(),
-        "angle_deg": math.degrees(estimate.angle),
+        "reliable": estimate.reliable,
+        "angle_deg": estimate.angle_deg,
         "iterations": estimate.iterations,
         "contour_std_deg": None if estimate.contour_std is None else math.degrees(estimate.contour_std),
         "converged": estimate.converged,
@@ -159,10 +200,10 @@ def _estimate_to_dict(estimate: Estimate) -> dict[str, Any]:
         "detection": found
         and {"box": list(found.box), "score": found.score, "label": found.label, "source": found.source.value},
         "trace": [
-            {"T_cam_obj": step.T_cam_obj.matrix.tolist(), "angle_deg": math.degrees(step.angle)}
-            for step in estimate.trace
+            {"T_cam_obj": step.T_cam_obj.matrix.tolist(), "angle_deg": step.angle_deg} for step in estimate.trace
         ],
         "timings_s": dict(estimate.timings),
+        "alternatives": [_estimate_to_dict(other) for other in estimate.alternatives],
     }
 
 
@@ -182,6 +223,7 @@ def _estimate_from_dict(entry: Mapping[str, Any]) -> Estimate:
         timings={stage: _number(seconds) for stage, seconds in entry["timings_s"].items()},
         contour_std=None if entry.get("contour_std_deg") is None else _radians(entry["contour_std_deg"]),
         branch=None if entry.get("branch") is None else Branch(entry["branch"]),
+        alternatives=tuple(_estimate_from_dict(other) for other in entry.get("alternatives", ())),
     )
 
 

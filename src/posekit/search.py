@@ -93,7 +93,8 @@ def estimates_of(
     for detection in detections:
         shift = WEIGHT * (detection.score - USUAL) if detection.source is Source.NOVEL else 0.0
         for estimate in estimator.estimate(view, [detection], shifted(options.least, -shift)):
-            found.append(replace(estimate, score=shifted(estimate.score, shift)))
+            others = tuple(replace(e, score=shifted(e.score, shift)) for e in estimate.alternatives)
+            found.append(replace(estimate, score=shifted(estimate.score, shift), alternatives=others))
     return found
 
 

@@ -115,6 +115,11 @@ class Tracked:
         return None if self.estimate is None else self.estimate.T_cam_obj
 
     @property
+    def reliable(self) -> bool:
+        """Whether there is an estimate that can be used."""
+        return self.estimate is not None and self.estimate.reliable
+
+    @property
     def angle(self) -> float | None:
         """The predicted rotation error, radians."""
         return None if self.estimate is None else self.estimate.angle

@@ -8,13 +8,11 @@ from typing import Annotated
 
 import typer
 
-from posekit.cli.options import ForceOption, WeightsOption
+from posekit.cli.options import ForceOption, OutOption, WeightsOption
 
 
 def demo(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the results; it must be new or empty.")] = Path(
-        "posekit-out/demo"
-    ),
+    out: OutOption = None,
     weights: WeightsOption = None,
     seed: Annotated[int, typer.Option(help="Of the example.")] = 0,
     force: ForceOption = False,
@@ -22,7 +20,7 @@ def demo(
     """Estimate a pose in an example that is made on the spot, and compare it with the truth."""
     from posekit.cli.output import Destination
 
-    destination = Destination.chosen(out, out, force, None)
+    destination = Destination.chosen(out, Path("posekit-out") / "demo", force, None)
     assert destination.folder is not None
 
     import numpy as np

@@ -74,7 +74,7 @@ def detect(
 
     if verify and not model:
         raise ConfigError("--verify looks for poses of meshes: pass --model MESH, or leave it out.")
-    folder = OutputFolder(out or Path("posekit-out") / f"{image.stem}-detections", force)
+    folder = OutputFolder.chosen(out, Path("posekit-out") / f"{image.stem}-detections", force)
     use_threads(threads)
     view = load_view(image, camera)
     meshes = [ObjectModel.load(path, units=units) for path in model or ()]

@@ -10,12 +10,14 @@ import typer
 
 from posekit.cli.options import (
     LOOP,
+    BlendOption,
     BoxOption,
     CameraOption,
     ContourOption,
     DetectionsOption,
     DetectorOption,
     ForceOption,
+    FormatOption,
     ImageArgument,
     IterationsOption,
     JsonOption,
@@ -25,6 +27,7 @@ from posekit.cli.options import (
     OutlineOption,
     OutOption,
     PresetOption,
+    RequireReliableOption,
     StopAngleOption,
     StopOption,
     SymmetryOption,
@@ -41,6 +44,13 @@ InitOption = Annotated[
     Literal["templates", "mvnet"], typer.Option(help="Where first poses come from.", rich_help_panel=LOOP)
 ]
 HypothesesOption = Annotated[int, typer.Option(metavar="K", help="First poses to refine.", rich_help_panel=LOOP)]
+TopOption = Annotated[
+    int,
+    typer.Option(
+        min=1, metavar="N", help="Keep the N best poses of each object: the result and its alternatives.",
+        rich_help_panel=LOOP,
+    ),
+]  # fmt: skip
 InstancesOption = Annotated[
     int, typer.Option(min=1, metavar="N", help="Of each mesh at most, where it is looked for.", rich_help_panel=LOOP)
 ]
@@ -72,6 +82,7 @@ def estimate(
     weights: WeightsOption = None,
     init: InitOption = "templates",
     hypotheses: HypothesesOption = 5,
+    top: TopOption = 1,
     update: UpdateOption = "auto",
     stop: StopOption = "angle",
     iterations: IterationsOption = 50,
@@ -82,11 +93,14 @@ def estimate(
     out: OutOption = None,
     force: ForceOption = False,
     json: JsonOption = None,
+    blend: BlendOption = 0.0,
+    format_: FormatOption = None,
+    require_reliable: RequireReliableOption = False,
 ) -> None:
     """Estimate objects' poses in a photograph, from their meshes. A box, a mask or detections help, but need not be."""
-    from posekit.cli.output import Destination
+    from posekit.cli.output import Destination, end_unless_reliable
 
-    destination = Destination.chosen(out, Path("posekit-out") / image.stem, force, json)
+    destination = Destination.chosen(out, Path("posekit-out") / image.stem, force, json, format_ or ())
 
     from posekit.cli.prompts import prompt_for
     from posekit.estimate import EstimateOptions, Estimators
@@ -95,7 +109,9 @@ def estimate(
     from posekit.search import SearchOptions, find_instances
 
     use_threads(threads)
-    options = EstimateOptions(init, hypotheses, update, stop, iterations, stop_angle, contour=contour, outline=outline)
+    options = EstimateOptions(
+        init, hypotheses, update, stop, iterations, stop_angle, contour=contour, outline=outline, top=top
+    )
     view = load_view(image, camera)
     meshes = [ObjectModel.load(path, units=units, symmetry=symmetry) for path in model]
     finder = prompt_for(box, mask, mask_from, detections, image, view.lens)
@@ -116,4 +132,6 @@ def estimate(
     with destination.working("estimating"):
         results = find_instances(estimators, view, meshes, found, search)
     paths = [{"image": image, "mesh": path} for path in model]
-    destination.deliver_all(view, [(estimators(each.model), each.instances) for each in results], paths)
+    destination.deliver_all(view, [(estimators(each.model), each.instances) for each in results], paths, blend)
+    if require_reliable:
+        end_unless_reliable([each for found_of in results for each in found_of.instances])

@@ -13,6 +13,7 @@ Stop = Literal["angle", "fixed"]
 MaskFrom = Literal["none", "grabcut", "filled"]
 
 INPUT, LOOP, OUTPUT = "Input", "Refinement", "Output"
+NOT_RELIABLE = 3  # exit code of --require-reliable
 
 ImageArgument = Annotated[Path, typer.Argument(help="The photograph.", show_default=False)]
 ModelOption = Annotated[
@@ -121,9 +122,39 @@ def use_threads(count: int | None) -> None:
         torch.set_num_threads(count)
 
 
+FormatOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--format",
+        metavar="csv|ros|blender|unity|tum|json",
+        help="Also write the poses for other programs: objects.csv, ros.yaml, blender.json, unity.json or NAME.tum; "
+        "repeat it. json is result.json, which is written anyway.",
+        rich_help_panel=OUTPUT,
+    ),
+]
+BlendOption = Annotated[
+    float,
+    typer.Option(
+        min=0, max=1, metavar="SHARE", help="How much of the rendered mesh the overlay shows, 0 to 1.",
+        rich_help_panel=OUTPUT,
+    ),
+]  # fmt: skip
+RequireReliableOption = Annotated[
+    bool,
+    typer.Option(
+        "--require-reliable",
+        help="End with exit code 3 where a result is not reliable, or nothing is found; results are written all the "
+        "same.",
+        rich_help_panel=OUTPUT,
+    ),
+]
 OutOption = Annotated[
     Path | None,
-    typer.Option(metavar="DIR", help="Folder for the results; it must be new or empty.", rich_help_panel=OUTPUT),
+    typer.Option(
+        metavar="DIR",
+        help="Folder for the results, new or empty. By default in posekit-out, or the next free posekit-out-2, -3.",
+        rich_help_panel=OUTPUT,
+    ),
 ]
 ForceOption = Annotated[
     bool, typer.Option("--force", help="Write into a folder that holds files already.", rich_help_panel=OUTPUT)

@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+import itertools
+import logging
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
 
-import numpy as np
 import typer
 
+from posekit.cli.options import NOT_RELIABLE
 from posekit.errors import OutputError
 from posekit.files import write_bytes_atomic, write_text_atomic
-from posekit.results import Estimate, estimates_to_json
+from posekit.geometry import rotation_angle
+from posekit.pose_formats import NamedPose, check_formats, pose_files
+from posekit.results import Estimate
+
+SMALL = 40  # pixels, longer side of an object's box below which that is said
+log = logging.getLogger("posekit")
 
 if TYPE_CHECKING:
     from posekit.estimate import PoseEstimator
+    from posekit.object_model import ObjectModel
     from posekit.view import View
 
 
@@ -33,15 +41,25 @@ class OutputFolder:
     force: bool = False
 
     def __post_init__(self) -> None:
-        try:
-            occupied = self.path.is_dir() and any(self.path.iterdir())
-        except OSError as error:
-            raise OutputError(f"the output folder {self.path} cannot be read: {error.strerror}.") from error
+        occupied = _occupied(self.path)
         if self.path.exists() and not self.path.is_dir():
             raise OutputError(f"{self.path} is a file: --out names a folder.")
         if occupied and not self.force:
             raise OutputError(f"the folder {self.path} holds files: pass --force to write into it, or another --out.")
         _check_writable(self.path, f"the output folder {self.path} cannot be written")
+
+    @classmethod
+    def chosen(cls, out: Path | None, default: Path, force: bool) -> OutputFolder:
+        """``out`` where it is given; else the default, with a number behind its first part where that holds files:
+        posekit-out/photo, posekit-out-2/photo, posekit-out-3/photo."""
+        if out is not None or force:
+            return cls(out or default, force)
+        first, *rest = default.parts
+        for number in itertools.count(1):
+            path = Path(first if number == 1 else f"{first}-{number}", *rest)
+            if not _occupied(path):
+                return cls(path)
+        raise AssertionError("counting has no end")
 
     def write(self, name: str, data: bytes | str) -> Path:
         """Write one file, whole or not at all, and return its path."""
@@ -55,6 +73,14 @@ class OutputFolder:
         else:
             write_bytes_atomic(path, data)
         return path
+
+
+def _occupied(folder: Path) -> bool:
+    """Whether there is such a folder and it holds something. Raises OutputError where it cannot be read."""
+    try:
+        return folder.is_dir() and any(folder.iterdir())
+    except OSError as error:
+        raise OutputError(f"the output folder {folder} cannot be read: {error.strerror}.") from error
 
 
 def _check_writable(folder: Path, trouble: str) -> None:
@@ -76,23 +102,30 @@ def _check_writable(folder: Path, trouble: str) -> None:
 class Destination:
     """What ``--out``, ``--force`` and ``--json`` ask for, checked before any work is done.
 
-    json: None, "-" or a file. With ``--json`` and no ``--out`` no folder is written.
+    json: None, "-" or a file. With ``--json`` and no ``--out`` no folder is written. formats: of further files with
+    the poses.
     """
 
     folder: OutputFolder | None
     json: str | None
+    formats: tuple[str, ...] = ()
 
     @classmethod
-    def chosen(cls, out: Path | None, default: Path, force: bool, json: str | None) -> Destination:
+    def chosen(
+        cls, out: Path | None, default: Path, force: bool, json: str | None, formats: Sequence[str] = ()
+    ) -> Destination:
         if json is not None and json != "-":
             if Path(json).is_dir():
                 raise OutputError(f"--json {json} is a folder: give a file, or - for standard output.")
             if not Path(json).parent.is_dir():
                 raise OutputError(f"--json {json}: there is no folder {Path(json).parent}. Make it first.")
             _check_writable(Path(json).parent, f"--json {json} cannot be written")
+        check_formats(formats)
         if out is None and json is not None:
+            if set(formats) - {"json"}:
+                raise OutputError(f"--format {formats[0]} with --json writes into a folder: pass --out DIR too.")
             return cls(None, json)
-        return cls(OutputFolder(out or default, force), json)
+        return cls(OutputFolder.chosen(out, default, force), json, tuple(formats))
 
     def say(self, text: str) -> None:
         """Tell the person something; on standard error where standard output is for JSON."""
@@ -107,28 +140,45 @@ class Destination:
             yield
 
     def deliver(
-        self, estimator: PoseEstimator, view: View, estimates: Sequence[Estimate], files: Mapping[str, Path]
+        self,
+        estimator: PoseEstimator,
+        view: View,
+        estimates: Sequence[Estimate],
+        files: Mapping[str, Path],
+        blend: float = 0.0,
     ) -> None:
         """`deliver_all` of one mesh. files: what they were made from, by name, for the result."""
-        self.deliver_all(view, [(estimator, estimates)], [files])
+        self.deliver_all(view, [(estimator, estimates)], [files], blend)
 
     def deliver_all(
         self,
         view: View,
         results: Sequence[tuple[PoseEstimator, Sequence[Estimate]]],
         files: Sequence[Mapping[str, Path]],
+        blend: float = 0.0,
     ) -> None:
-        """Print the estimates and write them: one result as JSON, and an overlay for each mesh. files: by mesh."""
+        """Print the estimates and write them: one result as JSON, and one overlay. files: by mesh. blend: how much of
+        the rendered meshes the overlay shows."""
+        from posekit.api import result_json
+
         for estimator, estimates in results:
             for estimate in estimates:
                 self.say(describe(estimate))
             if not estimates:
                 self.say(f"no pose: nothing in the picture could be taken for {estimator.model.name}.")
-        result = _result(view, results, files)
+            for note in limits(estimator.model, estimates):
+                log.info(note)
+        about: dict[str, object] = dict(files[0])
+        if len(files) > 1:
+            about["mesh"] = [each["mesh"] for each in files]
+        found = [estimate for _, estimates in results for estimate in estimates]
+        result = result_json(view, found, results[0][0].weights_hash, about)
         if self.folder is not None:
-            for name, data in _overlays(view, results):
-                self.say(f"overlay: {self.folder.write(name, data)}")
+            self.say(f"overlay: {self.folder.write('overlay.png', _overlay(view, results, blend))}")
             self.say(f"result: {self.folder.write('result.json', result)}")
+            for format_ in dict.fromkeys(self.formats):
+                for name, text in pose_files(format_, [named_pose(each) for each in found]).items():
+                    self.say(f"{format_}: {self.folder.write(name, text)}")
         if self.json == "-":
             typer.echo(result, nl=False)
         elif self.json is not None:
@@ -136,43 +186,62 @@ class Destination:
             self.say(f"result: {self.json}")
 
 
-def _overlays(view: View, results: Sequence[tuple[PoseEstimator, Sequence[Estimate]]]) -> Iterator[tuple[str, bytes]]:
-    """Names of files and PNGs: overlay.png of one mesh; of several overlay-1-NAME.png and so on."""
+def _overlay(view: View, results: Sequence[tuple[PoseEstimator, Sequence[Estimate]]], blend: float) -> bytes:
+    """All objects in one picture, PNG."""
     from posekit import draw
     from posekit.figures import overlay
 
-    for k, (estimator, estimates) in enumerate(results):
-        name = "overlay.png" if len(results) == 1 else f"overlay-{k + 1}-{estimator.model.name}.png"
-        yield name, draw.png(overlay(estimator.renderer, estimator.model, view, estimates))
+    found = [(estimator.model, estimate) for estimator, estimates in results for estimate in estimates]
+    return draw.png(overlay(results[0][0].renderer, view, found, blend))
 
 
 def describe(estimate: Estimate) -> str:
-    """An estimate for a person, some lines."""
+    """An estimate for a person, some lines: first whether it can be used."""
     rows = "\n".join("    " + " ".join(f"{value:9.5f}" for value in row) for row in estimate.T_cam_obj.matrix)
-    state = "converged" if estimate.converged else "not converged"
     steps = f"{estimate.iterations} iteration{'' if estimate.iterations == 1 else 's'}"
+    colour = None if estimate.reliable else typer.colors.RED
     return (
-        f"{estimate.model}: T_cam_obj (metres)\n{rows}\n"
-        f"    predicted error {np.rad2deg(estimate.angle):.1f} degrees, {state} after {steps}, "
-        f"score {estimate.score:.2f}, {estimate.timings['total']:.1f} s"
+        f"{estimate.model}: {typer.style(estimate.verdict, fg=colour, bold=True)}\n"
+        f"    score {estimate.score:.2f}, {steps}, {estimate.timings['total']:.1f} s\n"
+        f"    T_cam_obj (metres)\n{rows}"
+        + "".join(f"\n    {_alternative(k, estimate)}" for k in range(len(estimate.alternatives)))
     )
 
 
-def _result(
-    view: View, results: Sequence[tuple[PoseEstimator, Sequence[Estimate]]], files: Sequence[Mapping[str, Path]]
-) -> str:
-    """The entries of one mesh as they are; of several, ``mesh`` lists them."""
-    camera, lens = view.camera, view.lens
-    about: dict[str, object] = dict(files[0])
-    seen_by: dict[str, object] = {"K": camera.K, "width": camera.width, "height": camera.height}
-    if lens is not None:  # boxes, masks and overlays are of the undistorted picture
-        taken = {"K": lens.camera.K, "width": lens.camera.width, "height": lens.camera.height}
-        seen_by["undistorted_from"] = {**taken, "model": lens.model, "distortion_coefficients": list(lens.coefficients)}
-    if len(files) > 1:
-        about["mesh"] = [each["mesh"] for each in files]
-    return estimates_to_json(
-        [estimate for _, estimates in results for estimate in estimates],
-        weights_hash=results[0][0].weights_hash,
-        versions={name: version(name) for name in ("torch", "numpy", "opencv-python-headless", "moderngl")},
-        about={**about, "camera": seen_by},
+def _alternative(k: int, estimate: Estimate) -> str:
+    """The k-th alternative, how it differs, in a line; its matrix is in result.json."""
+    other = estimate.alternatives[k]
+    turn = math.degrees(rotation_angle(other.T_cam_obj.R.T @ estimate.T_cam_obj.R))
+    return f"alternative {k + 2}: turned by {turn:.0f} degrees, score {other.score:.2f}; {other.verdict}"
+
+
+def named_pose(estimate: Estimate, frame: int = 0, seconds: float | None = None) -> NamedPose:
+    """An estimate as other programs' formats take it."""
+    return NamedPose(
+        estimate.model, estimate.T_cam_obj, estimate.score, estimate.angle_deg, estimate.reliable, frame, seconds
     )
+
+
+def limits(model: ObjectModel, estimates: Sequence[Estimate]) -> list[str]:
+    """What the mesh and the picture do not allow, each once, with what helps."""
+    notes = []
+    if estimates and model.colors is None and model.texture is None:
+        notes.append(
+            f"{model.name} has no colours: only its shape is compared, and a turn that leaves the silhouette as it is "
+            "may go unseen. A mesh with vertex colours or a texture helps."
+        )
+    sizes = [max(x1 - x0, y1 - y0) for x0, y0, x1, y1 in (estimate.box for estimate in estimates)]
+    small = [size for size in sizes if size < SMALL]
+    if small:
+        count = f"{len(small)} of {len(sizes)} times " if len(sizes) > 1 else ""
+        notes.append(
+            f"{model.name} is only {min(small):.0f} pixels large {count}in the picture: its rotation is uncertain "
+            f"below {SMALL}. Take the photograph from nearer, or with more pixels."
+        )
+    return notes
+
+
+def end_unless_reliable(estimates: Sequence[Estimate]) -> None:
+    """For ``--require-reliable``: exit code 3 where there is no estimate, or one that is not reliable."""
+    if not estimates or not all(estimate.reliable for estimate in estimates):
+        raise typer.Exit(NOT_RELIABLE)

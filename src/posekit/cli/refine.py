@@ -10,10 +10,12 @@ import typer
 from posekit.cli.options import (
     INPUT,
     BesideOption,
+    BlendOption,
     BoxOption,
     CameraOption,
     ContourOption,
     ForceOption,
+    FormatOption,
     ImageArgument,
     IterationsOption,
     JsonOption,
@@ -23,6 +25,7 @@ from posekit.cli.options import (
     OutlineOption,
     OutOption,
     PresetOption,
+    RequireReliableOption,
     StopAngleOption,
     StopOption,
     SymmetryOption,
@@ -35,7 +38,11 @@ from posekit.cli.options import (
 
 PoseOption = Annotated[
     Path,
-    typer.Option(metavar="FILE", help="JSON: a result of estimate, or T_cam_obj (4x4, metres).", rich_help_panel=INPUT),
+    typer.Option(
+        metavar="FILE",
+        help="A result of estimate, JSON with T_cam_obj (4x4, metres), or text: a 4x4 matrix, or x y z qx qy qz qw.",
+        rich_help_panel=INPUT,
+    ),
 ]
 
 
@@ -62,11 +69,14 @@ def refine(
     out: OutOption = None,
     force: ForceOption = False,
     json: JsonOption = None,
+    blend: BlendOption = 0.0,
+    format_: FormatOption = None,
+    require_reliable: RequireReliableOption = False,
 ) -> None:
     """Refine a pose that is roughly known; a mask or a box helps, but neither is needed."""
-    from posekit.cli.output import Destination
+    from posekit.cli.output import Destination, end_unless_reliable
 
-    destination = Destination.chosen(out, Path("posekit-out") / f"{image.stem}-refined", force, json)
+    destination = Destination.chosen(out, Path("posekit-out") / f"{image.stem}-refined", force, json, format_ or ())
 
     from posekit.cli.prompts import detector_for
     from posekit.estimate import EstimateOptions, PoseEstimator
@@ -93,4 +103,6 @@ def refine(
         estimator = PoseEstimator(mesh, preset=preset, weights=weights, options=options)
     with destination.working("refining"):
         refined = estimator.refine(view, start)
-    destination.deliver(estimator, view, [refined], {"image": image, "mesh": model})
+    destination.deliver(estimator, view, [refined], {"image": image, "mesh": model}, blend)
+    if require_reliable:
+        end_unless_reliable([refined])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated
 
@@ -20,23 +21,28 @@ def render_views(
     model: ModelOption,
     views: Annotated[int, typer.Option(help="6: the faces of a cube; else evenly over the sphere.")] = 6,
     out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="By default posekit-out/MESH-views; it must be new or empty.")
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="New or empty. By default posekit-out/MESH-views, or posekit-out-2 and so on."
+        ),
     ] = None,
     size: Annotated[str, typer.Option(metavar="WxH", help="Of each view, pixels.")] = "640x480",
     units: UnitsOption = "auto",
     force: ForceOption = False,
 ) -> None:
-    """Render a mesh from all sides: RGB, masks and a contact sheet."""
+    """Render a mesh from all sides: RGB, masks, a contact sheet, and each view's camera and pose."""
     shape = _parse_size(size)
     if not 1 <= views <= _MOST_VIEWS:
         raise ConfigError(f"--views {views}: from 1 to {_MOST_VIEWS} can be drawn.")
 
     from posekit import draw
+    from posekit.camera import Camera
     from posekit.cli.output import OutputFolder
     from posekit.object_model import ObjectModel
-    from posekit.render import Renderer, render_views, view_rotations
+    from posekit.render import Renderer, centred_poses, render_views, view_rotations
+    from posekit.render.views import DEFAULT_FOV
 
-    folder = OutputFolder(out or Path("posekit-out") / f"{model.stem}-views", force)
+    folder = OutputFolder.chosen(out, Path("posekit-out") / f"{model.stem}-views", force)
     mesh = ObjectModel.load(model, units=units)
     renderer = Renderer(samples=4)
     rotations, thumbnails = view_rotations(views), []
@@ -47,6 +53,19 @@ def render_views(
             folder.write(f"{k:04d}.png", draw.png(view.image))
             folder.write(f"{k:04d}_mask.png", draw.png(view.mask))
             thumbnails.append(draw.fit(view.image, _thumbnail_size(shape)))
+    camera = Camera.from_fov(DEFAULT_FOV, *shape)
+    entries = [
+        {
+            "image": f"{k:04d}.png",
+            "mask": f"{k:04d}_mask.png",
+            "T_cam_obj": pose.matrix.tolist(),
+            "t_m": pose.t.tolist(),
+            "quat_wxyz": pose.quat_wxyz.tolist(),
+        }
+        for k, pose in enumerate(centred_poses(mesh, rotations, camera))
+    ]
+    about = {"mesh": str(model), "camera": {"K": camera.K.tolist(), "width": camera.width, "height": camera.height}}
+    folder.write("views.json", json.dumps({**about, "views": entries}, indent=1) + "\n")
     sheet = draw.grid(thumbnails, captions=[str(k) for k in range(views)])
     typer.echo(f"{views} views and {folder.write('contact_sheet.png', draw.png(sheet))}")
 

@@ -15,13 +15,16 @@ import typer
 from posekit.cli.options import (
     INPUT,
     LOOP,
+    NOT_RELIABLE,
     OUTPUT,
     CameraOption,
     DetectorOption,
     ForceOption,
+    FormatOption,
     ModelsOption,
     OutOption,
     PresetOption,
+    RequireReliableOption,
     SymmetryOption,
     ThreadsOption,
     UnitsOption,
@@ -30,6 +33,7 @@ from posekit.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from posekit.pose_formats import NamedPose
     from posekit.track import Tracked, Tracker
     from posekit.video import Frame, Frames, VideoWriter
 
@@ -44,7 +48,7 @@ def track(
     camera: CameraOption = None,
     pose: Annotated[
         list[Path] | None,
-        typer.Option(metavar="FILE", help="First pose, JSON; once for each mesh.", rich_help_panel=INPUT),
+        typer.Option(metavar="FILE", help="First pose, as refine takes it; once for each mesh.", rich_help_panel=INPUT),
     ] = None,
     detector: DetectorOption = None,
     units: UnitsOption = "auto",
@@ -94,11 +98,16 @@ def track(
     frames: Annotated[int | None, typer.Option(min=1, help="Frames at most.", rich_help_panel=OUTPUT)] = None,
     out: OutOption = None,
     force: ForceOption = False,
+    format_: FormatOption = None,
+    require_reliable: RequireReliableOption = False,
 ) -> None:
     """Follow objects through a video: poses as they come, and an overlay to look at."""
     from posekit.cli.output import OutputFolder
+    from posekit.pose_formats import check_formats, pose_files
 
-    folder = OutputFolder(out or Path("posekit-out") / f"{Path(source).stem or 'camera'}-track", force)
+    check_formats(format_ or ())
+
+    folder = OutputFolder.chosen(out, Path("posekit-out") / f"{Path(source).stem or 'camera'}-track", force)
 
     from posekit.errors import ImageError, PromptError
     from posekit.estimate import Estimators
@@ -133,7 +142,11 @@ def track(
         Tracker(mesh, pose=start, detector=finder, config=config, estimator=estimators(mesh))
         for mesh, start in zip(meshes, starts, strict=True)
     ]
-    counts = _run(trackers, sequence, folder, overlay, rerun, frames)
+    counts = _run(trackers, sequence, folder, overlay, rerun, frames, keep=bool(format_))
+    for kind in dict.fromkeys(format_ or ()):
+        for name, text in pose_files(kind, counts.poses).items():
+            counts.files.append(folder.write(name, text).name)
+    typer.echo(f"reliable: {counts.reliable} of {counts.used * len(trackers)} poses")
     typer.echo(", ".join(f"{count} {state}" for state, count in counts.states.items()))
     if counts.problems:
         typer.echo(f"{len(counts.problems)} frames could not be used; the first: {counts.problems[0]}", err=True)
@@ -146,6 +159,8 @@ def track(
     if not counts.states.get("tracked", 0) + counts.states.get("restarted", 0):
         names = ", ".join(m.name for m in meshes)
         raise PromptError(f"{names} was found in none of {counts.used} frames: pass --pose FILE for the first one.")
+    if require_reliable and counts.reliable < counts.used * len(trackers):
+        raise typer.Exit(NOT_RELIABLE)
 
 
 class _Counts:
@@ -153,15 +168,26 @@ class _Counts:
 
     def __init__(self) -> None:
         self.used = 0
+        self.reliable = 0
         self.states: dict[str, int] = {}
         self.problems: list[str] = []
+        self.poses: list[NamedPose] = []
         self.files: list[str] = ["poses.jsonl", "poses.csv"]
 
 
 def _run(
-    trackers: Sequence[Tracker], sequence: Frames, folder: Any, overlay: bool, rerun: bool, most: int | None
+    trackers: Sequence[Tracker],
+    sequence: Frames,
+    folder: Any,
+    overlay: bool,
+    rerun: bool,
+    most: int | None,
+    *,
+    keep: bool,
 ) -> _Counts:
-    """Track every frame, and write each as soon as it is done: a killed run keeps its frames."""
+    """Track every frame, and write each as soon as it is done: a killed run keeps its frames. keep: all poses, for
+    formats that are written at the end."""
+    from posekit.cli.output import named_pose
     from posekit.errors import OutputError
     from posekit.video import VideoWriter
 
@@ -188,6 +214,8 @@ def _run(
             for k, (tracker, result) in enumerate(zip(trackers, results, strict=True)):
                 lines.write(_line(frame, tracker.model.name, result) + "\n")
                 if result.estimate is not None:
+                    if keep:
+                        counts.poses.append(named_pose(result.estimate, frame.number, frame.seconds))
                     table.write(_row(frame, _number(tracker.model.name, k), result, seconds) + "\n")
             record(frame, results)
             if overlay and frame.image is not None:
@@ -211,6 +239,7 @@ def _step(trackers: Sequence[Tracker], frame: Frame, counts: _Counts) -> list[Tr
         results = [tracker.step(frame.image, frame.camera, frame.valid) for tracker in trackers]
     for result in results:
         counts.states[result.state] = counts.states.get(result.state, 0) + 1
+        counts.reliable += result.reliable
     return results
 
 
@@ -221,6 +250,7 @@ def _line(frame: Frame, name: str, result: Tracked) -> str:
         **({"file": frame.file} if frame.file else {}),
         "model": name,
         "state": result.state,
+        "reliable": result.reliable,
         "T_cam_obj": None if pose is None else pose.matrix.tolist(),
         "angle_deg": None if angle is None else math.degrees(angle),
         "score": None if result.estimate is None else result.estimate.score,
@@ -251,19 +281,17 @@ def _number(name: str, k: int) -> int:
 
 def _draw(writer: VideoWriter, frame: Frame, trackers: Sequence[Tracker], results: Sequence[Tracked]) -> None:
     from posekit import draw
+    from posekit.figures import outlined
 
     assert frame.image is not None and frame.camera is not None
     picture, told = frame.image, []
     for tracker, result in zip(trackers, results, strict=True):
-        angle = "" if result.angle is None else f" {math.degrees(result.angle):.1f} deg"
-        told.append(f"{tracker.model.name}: {result.state}{angle}")
+        angle = "" if result.angle is None else f" {math.degrees(result.angle):.1f} degrees"
+        told.append(f"{tracker.model.name}: {result.state}{angle}{'' if result.reliable else ' NOT RELIABLE'}")
         if result.T_cam_obj is None:
             continue
-        [drawn] = tracker.estimator.renderer.render(
-            tracker.model, [result.T_cam_obj], frame.camera, rgb=False, coords=False
-        )
-        assert drawn.mask is not None
-        picture = draw.contour(picture, drawn.mask)
+        colour = draw.GREEN if result.reliable else draw.RED
+        picture = outlined(tracker.renderer, picture, frame.camera, tracker.model, result.T_cam_obj, colour)
         length = 0.6 * float(tracker.model.extents.max())
         picture = draw.axes(picture, frame.camera, result.T_cam_obj, length, tracker.model.center)
     writer.write(draw.caption(picture, f"{frame.number}  " + "  ".join(told)))

@@ -12,12 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from posekit import draw, metrics
-from posekit.camera import Camera
 from posekit.data.datasets import Dataset
 from posekit.evaluate import charts, table
 from posekit.evaluate.scoring import MEASURES, Case, Guess, Scored
+from posekit.figures import outlined
 from posekit.geometry import Pose
-from posekit.object_model import ObjectModel
 from posekit.render import Renderer
 from posekit.zoom import zoom_to_pose
 
@@ -39,9 +38,10 @@ color:var(--ink);font:15px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,sans-se
 h1{font-size:25px;margin:0 0 4px}h2{font-size:18px;margin:36px 0 10px}p{margin:4px 0}.soft{color:var(--soft)}
 .big{display:flex;flex-wrap:wrap;gap:12px;margin:18px 0}.big div{background:var(--card);border-radius:8px;
 padding:10px 16px;min-width:120px}.big b{display:block;font-size:22px;font-variant-numeric:tabular-nums}
-.scroll{overflow-x:auto}table{border-collapse:collapse;font-size:13.5px;font-variant-numeric:tabular-nums}
-th,td{padding:4px 9px;text-align:right;border-bottom:1px solid var(--line);white-space:nowrap}
-th{font-weight:600;color:var(--soft)}th:first-child,td:first-child{text-align:left}tr.sum td{font-weight:600}
+.scroll{overflow-x:auto}table{border-collapse:collapse;font-size:12.5px;font-variant-numeric:tabular-nums}
+th,td{padding:4px 5px;text-align:right;border-bottom:1px solid var(--line);white-space:nowrap}
+th{font-weight:600;white-space:normal;vertical-align:bottom;
+color:var(--soft)}th:first-child,td:first-child{text-align:left}tr.sum td{font-weight:600}
 .charts{display:grid;grid-template-columns:repeat(auto-fill,minmax(320px,1fr));gap:14px}
 figure{margin:0;background:var(--card);border-radius:8px;padding:10px}figcaption{font-size:13px;font-weight:600}
 svg{width:100%;height:auto;display:block}svg.wide{max-width:760px}svg.spark{width:110px;height:24px;display:inline-block}
@@ -49,7 +49,7 @@ svg text{font:11px system-ui,sans-serif;fill:var(--soft)}.left,.name{text-anchor
 .grid{stroke:var(--line);stroke-width:1}.line{fill:none;stroke-width:2}.bar{fill:var(--c0)}
 .line.c0{stroke:var(--c0)}.line.c1{stroke:var(--c1)}.line.c2{stroke:var(--c2)}.line.c3{stroke:var(--c3)}
 .fill.c0{fill:var(--c0)}.fill.c1{fill:var(--c1)}.fill.c2{fill:var(--c2)}.fill.c3{fill:var(--c3)}.fill.c4{fill:var(--c4)}
-.cases{display:grid;grid-template-columns:repeat(auto-fill,minmax(200px,1fr));gap:12px}
+.cases{display:grid;grid-template-columns:repeat(auto-fill,minmax(340px,1fr));gap:12px}
 .cases div{background:var(--card);border-radius:8px;overflow:hidden;font-size:12.5px}
 .cases img{width:100%;display:block}.cases p{padding:0 9px}.cases p:last-child{padding-bottom:7px}
 code{font-size:13px;overflow-wrap:anywhere}
@@ -201,7 +201,7 @@ def _cases(scored: Scored, data: Dataset) -> str:
     count = min(SHOWN, len(order) // 2)  # nothing is shown twice
     best = [_case(scored, int(k), data, renderer) for k in order[: len(order) - count][:SHOWN]]
     worst = [_case(scored, int(k), data, renderer) for k in order[::-1][:count]]
-    note = "<p class=soft>Orange: the truth. Green: the estimate. The line: rotation error by refinement step.</p>"
+    note = "<p class=soft>Left, orange: the truth. Right, green: the estimate. The line: rotation error by step.</p>"
     return _section("Best cases", f"{note}<div class=cases>{''.join(best)}</div>") + _section(
         "Worst cases", f"<div class=cases>{''.join(worst)}</div>"
     )
@@ -228,23 +228,16 @@ def _case(scored: Scored, k: int, data: Dataset, renderer: Renderer) -> str:
 
 
 def tile(case: Case, guess: Guess | None, data: Dataset, renderer: Renderer) -> draw.Image:
-    """The photograph round the object with the outlines of truth and estimate."""
+    """The photograph round the object twice, side by side: with the outline of the truth, and of the estimate."""
     view, model = data.view(case.scene, case.image), data.model(case.obj_id)
-    poses: list[tuple[Pose, draw.Colour]] = [(case.T_cam_obj, draw.ORANGE)]
-    if guess is not None:
-        poses.append((guess.T_cam_obj, draw.GREEN))
     zoom = zoom_to_pose(view.camera, case.T_cam_obj @ model.T_obj_ctr, model.outline - model.center, _TILE, enlarge=1.8)
     picture = view.zoomed(zoom).image
-    for pose, colour in poses:
-        mask = _silhouette(renderer, model, Pose.rotation(zoom.R_view_cam) @ pose, zoom.camera)
-        picture = draw.contour(picture, mask, colour)
-    return picture
-
-
-def _silhouette(renderer: Renderer, model: ObjectModel, pose: Pose, camera: Camera) -> NDArray[np.bool_]:
-    [drawn] = renderer.render(model, [pose], camera, rgb=False, coords=False)
-    assert drawn.mask is not None
-    return drawn.mask
+    turn = Pose.rotation(zoom.R_view_cam)
+    truth = outlined(renderer, picture, zoom.camera, model, turn @ case.T_cam_obj, draw.ORANGE)
+    found = picture
+    if guess is not None:
+        found = outlined(renderer, picture, zoom.camera, model, turn @ guess.T_cam_obj, draw.GREEN)
+    return draw.grid([truth, found], columns=2)
 
 
 def _jpeg(image: draw.Image) -> bytes:
