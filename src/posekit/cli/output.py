@@ -7,14 +7,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
 
 import numpy as np
 import typer
 
 from posekit.errors import OutputError
-from posekit.files import write_bytes_atomic, write_text_atomic
+from posekit.files import check_writable, write_bytes_atomic, write_text_atomic
 from posekit.results import Estimate, estimates_to_json
 
 if TYPE_CHECKING:
@@ -41,7 +40,7 @@ class OutputFolder:
             raise OutputError(f"{self.path} is a file: --out names a folder.")
         if occupied and not self.force:
             raise OutputError(f"the folder {self.path} holds files: pass --force to write into it, or another --out.")
-        _check_writable(self.path, f"the output folder {self.path} cannot be written")
+        check_writable(self.path, f"the output folder {self.path} cannot be written")
 
     def write(self, name: str, data: bytes | str) -> Path:
         """Write one file, whole or not at all, and return its path."""
@@ -55,21 +54,6 @@ class OutputFolder:
         else:
             write_bytes_atomic(path, data)
         return path
-
-
-def _check_writable(folder: Path, trouble: str) -> None:
-    """Whether a file can be made in a folder, or the folder in the nearest one that is there: by trying. Raises
-    OutputError."""
-    there = folder
-    while not there.exists() and there != there.parent:
-        there = there.parent
-    try:
-        if not there.is_dir():
-            raise NotADirectoryError(20, f"{there} is a file")
-        with TemporaryFile(dir=there):
-            pass
-    except OSError as error:
-        raise OutputError(f"{trouble}: {error.strerror}. Choose another place, or change its permissions.") from error
 
 
 @dataclass(frozen=True)
@@ -89,7 +73,7 @@ class Destination:
                 raise OutputError(f"--json {json} is a folder: give a file, or - for standard output.")
             if not Path(json).parent.is_dir():
                 raise OutputError(f"--json {json}: there is no folder {Path(json).parent}. Make it first.")
-            _check_writable(Path(json).parent, f"--json {json} cannot be written")
+            check_writable(Path(json).parent, f"--json {json} cannot be written")
         if out is None and json is not None:
             return cls(None, json)
         return cls(OutputFolder(out or default, force), json)
