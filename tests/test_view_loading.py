@@ -2,11 +2,11 @@
 
 Photographs. Accepted: PNG, JPEG, TIFF, BMP, WebP, GIF's first picture, grey, palette, CMYK, transparent, 8 and 16 bits,
 turned by EXIF. Warned about: 10 and 12 bits in a file of 16, damaged EXIF data, a baseline JPEG that lacks a few of its
-last rows, a camera that nobody knows. Refused: what is missing, empty, no picture, damaged, cut off further up, floating
-point, under 16 pixels a side or over POSEKIT_MOST_PIXELS.
+last rows, a camera that nobody knows. Refused: what is missing, empty, no picture, damaged, cut off further up, of
+floating-point numbers, under 16 pixels a side or over POSEKIT_MOST_PIXELS.
 Masks. Accepted: any picture, white where the object is, brighter than half. Warned about: values in between, what looks
 inverted. Refused: labels, another size than the photograph's, nothing in it.
-Poses. Accepted: T_cam_obj in metres, a result.json, BOP's pair in mm. Refused: everything else.
+Poses. Accepted: T_cam_obj in metres or its 4x4 numbers alone, a result.json, BOP's pair in mm. Refused: everything else.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def test_not_an_image(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["png", "jpg", "bmp", "tif", "webp"])
-@pytest.mark.parametrize("share", [0.02, 0.5, 0.98])
+@pytest.mark.parametrize("share", [0.02, 0.5, 0.8])
 def test_truncated_pictures_are_not_half_decoded(tmp_path: Path, suffix: str, share: float) -> None:
     path = tmp_path / f"a.{suffix}"
     Image.fromarray(PIXELS).save(path)
@@ -506,3 +506,13 @@ def test_the_limit_of_pixels_can_be_set(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setenv("POSEKIT_MOST_PIXELS", "many")
     with pytest.raises(ConfigError, match="POSEKIT_MOST_PIXELS=many: give a whole number"):
         load_image(path)
+
+
+def test_a_pose_as_a_bare_matrix(tmp_path: Path) -> None:
+    matrix = np.eye(4)
+    matrix[:3, 3] = (0.1, 0.2, 0.9)
+    (tmp_path / "p.json").write_text(json.dumps(matrix.tolist()))
+    np.testing.assert_allclose(load_pose(tmp_path / "p.json").matrix, matrix)
+    (tmp_path / "p.json").write_text("[[1, 2], [3]]")
+    with pytest.raises(PromptError, match="holds no pose"):
+        load_pose(tmp_path / "p.json")

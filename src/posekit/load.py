@@ -30,6 +30,7 @@ Size = tuple[int, int]
 
 ASSUMED_FOV = math.radians(60.0)  # of the longer side, where nothing says what the camera was
 SMALLEST_SIDE = 16
+_BLOCK = 16  # rows of pixels that a JPEG codes together, of which the last decoded ones may be a part
 _MOST_LOST = 0.05  # of a JPEG's rows that may be missing at its end
 
 _FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
@@ -159,8 +160,8 @@ def _cut_short(path: Path, image: Image.Image) -> Image.Image:
     values = np.asarray(found.convert("L"), dtype=np.int16)
     filled: NDArray[np.bool_] = np.abs(np.diff(values, axis=1)).max(axis=1) <= 1  # rows of one grey
     lost = int(np.argmin(filled[::-1])) if not filled.all() else len(filled)
-    if lost > _MOST_LOST * len(filled):
-        raise OSError(f"it is cut off: of {len(filled)} rows the last {lost} are missing")
+    if lost + _BLOCK > _MOST_LOST * len(filled):
+        raise OSError(f"it is cut off: of {len(filled)} rows the last {lost + _BLOCK} or so are missing")
     log.warning("%s: the file is cut off at its end: its last rows of pixels may be grey. Copy it again.", path.name)
     return found
 
@@ -299,7 +300,7 @@ def load_camera(source: str | Path, size: Size, image: str | Path | None = None)
 def load_pose(path: str | Path) -> Pose:
     """``T_cam_obj`` (metres) from a JSON file.
 
-    Read are ``{"T_cam_obj": 4x4}`` in metres, a posekit result (its first estimate), and BOP's ``cam_R_m2c`` with
+    Read are ``{"T_cam_obj": 4x4}`` or the 4x4 numbers alone in metres, a posekit result (its first estimate), and BOP's ``cam_R_m2c`` with
     ``cam_t_m2c`` in mm. Raises PromptError where the file is missing or something else.
     """
     path = Path(path)
@@ -322,6 +323,8 @@ def load_pose(path: str | Path) -> Pose:
 
 
 def _pose_from_dict(data: Any) -> Pose:
+    if isinstance(data, list):
+        return Pose.from_matrix(data)
     if not isinstance(data, dict):
         raise ValueError("its outermost part is not {...}")
     if "T_cam_obj" in data:
