@@ -6,7 +6,7 @@ last rows, a camera that nobody knows. Refused: what is missing, empty, no pictu
 floating-point numbers, under 16 pixels a side or over POSEKIT_MOST_PIXELS.
 Masks. Accepted: any picture, white where the object is, brighter than half. Warned about: values in between, what looks
 inverted. Refused: labels, another size than the photograph's, nothing in it.
-Poses. Accepted: T_cam_obj in metres or its 4x4 numbers alone, a result.json, BOP's pair in mm. Refused: everything else.
+Poses. Accepted: T_cam_obj in metres or its 4x4 numbers alone, a result.json, BOP's pair in mm. Refused: all else.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import pytest
 from PIL import Image
 
 from posekit.errors import CameraError, ConfigError, ImageError, PromptError
-from posekit.load import camera_from_exif, load_camera, load_image, load_mask, load_view, parse_box
+from posekit.load import camera_from_exif, load_camera, load_image, load_mask, load_pose, load_view, parse_box
 
 PIXELS = np.random.default_rng(0).integers(0, 256, size=(48, 64, 3), dtype=np.uint8)
 SIZE = (64, 48)
@@ -516,3 +516,28 @@ def test_a_pose_as_a_bare_matrix(tmp_path: Path) -> None:
     (tmp_path / "p.json").write_text("[[1, 2], [3]]")
     with pytest.raises(PromptError, match="holds no pose"):
         load_pose(tmp_path / "p.json")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        json.dumps({"T_cam_obj": [[10**400, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]]}),
+        json.dumps({"cam_R_m2c": [1, 0, 0, 0, 1, 0, 0, 0, 1], "cam_t_m2c": [0, 0, 10**400]}),
+        "[" * 100_000,
+    ],
+    ids=["matrix", "bop", "deep"],
+)
+def test_poses_of_numbers_or_depths_that_python_cannot_have(text: str, tmp_path: Path) -> None:
+    (tmp_path / "p.json").write_text(text)
+    with pytest.raises(PromptError, match="holds no pose"):
+        load_pose(tmp_path / "p.json")
+
+
+def test_a_mask_whose_header_has_no_bits(tmp_path: Path) -> None:
+    """Pillow raises a TypeError for 0 bits a pixel; the header's checksum is right."""
+    data = bytearray(png(tmp_path / "m.png").read_bytes())
+    data[24] = 0
+    data[29:33] = zlib.crc32(data[12:29]).to_bytes(4, "big")
+    (tmp_path / "m.png").write_bytes(data)
+    with pytest.raises(PromptError, match="is damaged or cannot be read"):
+        load_mask(tmp_path / "m.png")

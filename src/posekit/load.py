@@ -145,7 +145,7 @@ def _opened(path: Path, what: str, kind: type[InputError]) -> Iterator[Image.Ima
         ) from error
     except Image.DecompressionBombError as error:
         raise kind(_too_large(path, "far more pixels")) from error
-    except (OSError, ValueError, SyntaxError, EOFError, IndexError) as error:
+    except (OSError, ValueError, SyntaxError, EOFError, IndexError, TypeError, OverflowError, KeyError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise kind(f"the {what} {path} is damaged or cannot be read ({reason}): make or copy it again.") from error
 
@@ -300,8 +300,8 @@ def load_camera(source: str | Path, size: Size, image: str | Path | None = None)
 def load_pose(path: str | Path) -> Pose:
     """``T_cam_obj`` (metres) from a JSON file.
 
-    Read are ``{"T_cam_obj": 4x4}`` or the 4x4 numbers alone in metres, a posekit result (its first estimate), and BOP's ``cam_R_m2c`` with
-    ``cam_t_m2c`` in mm. Raises PromptError where the file is missing or something else.
+    Read are ``{"T_cam_obj": 4x4}`` or the 4x4 numbers alone in metres, a posekit result (its first estimate), and BOP's
+    ``cam_R_m2c`` with ``cam_t_m2c`` in mm. Raises PromptError where the file is missing or something else.
     """
     path = Path(path)
     needed = (
@@ -317,7 +317,7 @@ def load_pose(path: str | Path) -> Pose:
         return _pose_from_dict(data)
     except OSError as error:
         raise PromptError(f"the pose file {path} cannot be read ({error.strerror}): check the path.") from error
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         reason = f"it has no {error.args[0]}" if isinstance(error, KeyError) else str(error)
         raise PromptError(f"{path} holds no pose ({reason}): {needed}") from error
 
