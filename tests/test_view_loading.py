@@ -533,11 +533,13 @@ def test_poses_of_numbers_or_depths_that_python_cannot_have(text: str, tmp_path:
         load_pose(tmp_path / "p.json")
 
 
-def test_a_mask_whose_header_has_no_bits(tmp_path: Path) -> None:
-    """Pillow raises a TypeError for 0 bits a pixel; the header's checksum is right."""
+def test_a_mask_whose_pixels_are_damaged_though_its_checksums_are_right(tmp_path: Path) -> None:
     data = bytearray(png(tmp_path / "m.png").read_bytes())
-    data[24] = 0
-    data[29:33] = zlib.crc32(data[12:29]).to_bytes(4, "big")
+    start = data.index(b"IDAT")
+    length = int.from_bytes(data[start - 4 : start], "big")
+    for k in range(start + 20, start + 60):
+        data[k] ^= 0xFF
+    data[start + 4 + length : start + 8 + length] = zlib.crc32(data[start : start + 4 + length]).to_bytes(4, "big")
     (tmp_path / "m.png").write_bytes(data)
     with pytest.raises(PromptError, match="is damaged or cannot be read"):
         load_mask(tmp_path / "m.png")

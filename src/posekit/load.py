@@ -136,8 +136,8 @@ def _opened(path: Path, what: str, kind: type[InputError]) -> Iterator[Image.Ima
                 try:
                     image.load()
                     whole: Image.Image = image
-                except OSError:
-                    whole = _cut_short(path, image)
+                except OSError as error:
+                    whole = _cut_short(path, image, error)
                 yield whole
     except UnidentifiedImageError as error:
         raise kind(
@@ -150,11 +150,11 @@ def _opened(path: Path, what: str, kind: type[InputError]) -> Iterator[Image.Ima
         raise kind(f"the {what} {path} is damaged or cannot be read ({reason}): make or copy it again.") from error
 
 
-def _cut_short(path: Path, image: Image.Image) -> Image.Image:
-    """A baseline JPEG whose file ends a little early, as OpenCV reads it, which is told. Raises the error of what
-    decodes it for other pictures, and OSError where more than a few rows are missing."""
+def _cut_short(path: Path, image: Image.Image, error: OSError) -> Image.Image:
+    """A baseline JPEG whose file ends a little early, as OpenCV reads it, which is told. Raises the given error
+    for other pictures, and OSError where more than a few rows are missing."""
     if image.format not in ("JPEG", "MPO") or image.info.get("progressive"):
-        image.load()
+        raise error
     found = Image.open(io.BytesIO(path.read_bytes() + b"\xff\xd9"))  # the marker of its end
     found.load()
     values = np.asarray(found.convert("L"), dtype=np.int16)
