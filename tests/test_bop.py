@@ -1,4 +1,10 @@
-"""Data sets in BOP layout, read from a small one made here."""
+"""BOP data sets. Accepted: pictures in rgb or gray with any suffix, folders and pictures with zeros or not, PLY, OBJ,
+GLB and STL meshes in mm, JSON with a byte order mark, no scene_gt_info, no targets or BOP'24's, a sensor's files
+(scene_camera_SENSOR.json, rgb_SENSOR; chosen as test:SENSOR where there are several). Warned about: meshes in another
+unit (by the stated diameter, or where mm make no object), a stated diameter in metres or far from the mesh's, a mesh
+so small that it may be in metres. Refused: missing or damaged files, poses in metres, entries of another kind than
+BOP's, lens distortion in scene_camera.json, scene_gt_info that does not fit scene_gt.
+"""
 
 from __future__ import annotations
 
@@ -173,7 +179,7 @@ def test_annotations_that_do_not_fit(root: Path) -> None:
     put(folder / "scene_gt_info.json", {"3": []})
     with pytest.raises(InputError, match=r"has 0 entries for image 3, scene_gt.json 3: they belong together"):
         BopDataset(root).instances(2, 3)
-    put(folder / "scene_gt.json", {"3": [{"obj_id": 5, "cam_R_m2c": [0] * 9, "cam_t_m2c": [0, 0, 1]}]})
+    put(folder / "scene_gt.json", {"3": [{"obj_id": 5, "cam_R_m2c": [0] * 9, "cam_t_m2c": [0, 0, 900]}]})
     put(folder / "scene_gt_info.json", {"3": [{"bbox_obj": [0] * 4, "bbox_visib": [0] * 4, "visib_fract": 1}]})
     with pytest.raises(InputError, match=r"annotation 0 of image 3 .* is not BOP's"):
         BopDataset(root).instances(2, 3)
@@ -228,3 +234,93 @@ def test_targets_of_pictures_alone_ask_for_all_that_is_in_them(root: Path) -> No
     assert data.images() == [(2, 3)]
     assert [(t.obj_id, t.count) for t in data.targets or ()] == [(5, 2), (9, 1)]
     assert len(data.instances(2, 3)) == 3
+
+
+@pytest.mark.parametrize("stated", [None, 155.0])
+def test_a_mesh_in_metres_is_told_by_the_stated_diameter(
+    stated: float | None, root: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Two metres long, so "2 mm" would be an object too."""
+    mesh = trimesh.creation.box((2.0, 0.5, 0.4))
+    mesh.export(root / "models" / "obj_000005.ply")
+    long = float(np.linalg.norm((2.0, 0.5, 0.4)))
+    put(root / "models" / "models_info.json", {} if stated is None else {"5": {"diameter": 1000 * long}})
+    model = BopDataset(root).model(5)
+    assert model.diameter == pytest.approx(long if stated else long / 1000, rel=1e-5)
+    assert ("taken for metres, 2100 mm long" if stated else "where it is in metres") in caplog.text
+
+
+def test_a_diameter_stated_in_metres_is_measured(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    size = BopDataset(root).model(5).diameter
+    put(root / "models" / "models_info.json", {"5": {"diameter": size}})
+    assert BopDataset(root).measured_model(5).diameter == pytest.approx(size)
+    assert "is in metres, not in BOP's mm" in caplog.text
+
+
+def test_a_stated_diameter_of_something_else_is_told(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    put(root / "models" / "models_info.json", {"5": {"diameter": 4000.0}})
+    assert BopDataset(root).measured_model(5).diameter == pytest.approx(4.0)
+    assert "models_info.json says 4000" in caplog.text
+
+
+def test_poses_in_metres_are_refused(root: Path) -> None:
+    path = root / "test" / "000002" / "scene_gt.json"
+    data = json.loads(path.read_text())
+    for entry in (e for entries in data.values() for e in entries):
+        entry["cam_t_m2c"] = [v / 1000 for v in entry["cam_t_m2c"]]
+    put(path, data)
+    with pytest.raises(InputError, match="seems to be in metres; multiply it by 1000"):
+        BopDataset(root).instances(2, 3)
+
+
+def as_sensor(folder: Path, name: str) -> None:
+    for kind in ("scene_camera", "scene_gt", "scene_gt_info"):
+        (folder / f"{kind}_{name}.json").write_bytes((folder / f"{kind}.json").read_bytes())
+    for kind in ("rgb", "mask_visib"):
+        (folder / f"{kind}_{name}").mkdir()
+        for path in (folder / kind).iterdir():
+            (folder / f"{kind}_{name}" / path.name).write_bytes(path.read_bytes())
+
+
+def test_the_pictures_of_a_sensor(root: Path) -> None:
+    folder = root / "test" / "000002"
+    as_sensor(folder, "photoneo")
+    for path in [folder / f"{kind}.json" for kind in ("scene_camera", "scene_gt", "scene_gt_info")]:
+        path.unlink()
+    data = BopDataset(root)
+    assert data.image_path(2, 3) == folder / "rgb_photoneo" / "000003.png"
+    assert data.view(2, 3).camera.fx == 503
+    assert data.instances(2, 3)[1].mask().sum() == 8
+    as_camera = json.loads((folder / "scene_camera_photoneo.json").read_text())
+    put(folder / "scene_camera_cam1.json", as_camera)
+    with pytest.raises(InputError, match="sensors cam1, photoneo: choose one, as --split test:cam1"):
+        BopDataset(root).images(2)
+    assert BopDataset(root, "test:photoneo").images(2) == [(2, 3), (2, 11)]
+    with pytest.raises(InputError, match="no sensor 'left'; there are cam1, photoneo"):
+        BopDataset(root, "test:left").images(2)
+
+
+@pytest.mark.parametrize(
+    ("name", "entry"), [("scene_camera.json", [1]), ("scene_camera.json", "x"), ("scene_gt.json", {"obj_id": 1})]
+)
+def test_entries_of_another_kind(name: str, entry: object, root: Path) -> None:
+    put(root / "test" / "000002" / name, {"3": entry})
+    with pytest.raises(InputError, match=f"{name}, image 3: its entry is no (map|list)"):
+        BopDataset(root).instances(2, 3), BopDataset(root).camera(2, 3, (64, 48))
+
+
+@pytest.mark.parametrize("entry", [{}, {"cam_K": None}, {"cam_K": [10**400] * 9}, {"cam_K": [1, 2]}])
+def test_a_camera_that_is_none(entry: object, root: Path) -> None:
+    put(root / "test" / "000002" / "scene_camera.json", {"3": entry})
+    with pytest.raises(CameraError, match=r"scene_camera\.json, image 3"):
+        BopDataset(root).camera(2, 3, (64, 48))
+
+
+def test_distortion_in_scene_camera_is_refused(root: Path) -> None:
+    path = root / "test" / "000002" / "scene_camera.json"
+    data = json.loads(path.read_text())
+    data["3"]["dist_coeffs"] = [-0.1, 0.02, 0, 0, 0]
+    put(path, data)
+    with pytest.raises(CameraError, match="image 3: its picture has lens distortion"):
+        BopDataset(root).view(2, 3)
+    assert BopDataset(root).view(2, 11).camera.fx == 511

@@ -4,6 +4,12 @@ Read: fx,fy,cx,cy as text; JSON, YAML (OpenCV's, ROS's, PyYAML's), XML, plain nu
 width and height or as a pair in either order; OpenCV's 4, 5, 8, 12, 14 and fisheye coefficients as a list, a matrix or
 one by one. Refused: another shape, skew, other models, coefficients or sizes that are no numbers. Warned of: a
 principal point far from the middle.
+
+Accepted: fx,fy,cx,cy; BOP's camera.json and scene_camera.json; JSON, YAML and XML with a matrix or four numbers under
+the names that programs use; K's numbers as text, row by row or column by column; OpenCV's 4, 5, 8, 12, 14 and fisheye
+coefficients; sizes in any spelling. Told: a camera that is scaled, lens distortion, a principal point far from the
+middle. Refused: skew, another shape of the picture, two cameras in a file, distortion that cannot be read or undone,
+files over 20 MB, YAML over 300 000 letters or 50 brackets deep.
 """
 
 from __future__ import annotations
@@ -259,3 +265,16 @@ def test_boxes_and_masks_of_the_photograph_are_moved(tmp_path: Path) -> None:
         middle = 0.5 * (found.box[0] + found.box[2]) - 0.5, 0.5 * (found.box[1] + found.box[3]) - 0.5
         np.testing.assert_allclose(middle, (x, y), atol=2)
         assert found.mask is None or found.mask.shape == view.image.shape[:2]
+
+
+@pytest.mark.parametrize("text", ["[" * 3000, "a: " + "[" * 60 + "]" * 60, "# " + "x" * 400_000])
+def test_yaml_that_takes_its_parser_long_is_refused_at_once(text: str, tmp_path: Path) -> None:
+    (tmp_path / "c.yml").write_text(text)
+    with pytest.raises(CameraError, match="longer than 300000 letters or deeper than 50 brackets"):
+        load_calibration(tmp_path / "c.yml", (640, 480))
+
+
+def test_a_number_too_large_for_a_float(tmp_path: Path) -> None:
+    (tmp_path / "c.json").write_text('{"K": [%s, 0, 1, 0, 1, 1, 0, 0, 1]}' % (10**400))
+    with pytest.raises(CameraError, match="holds no camera that posekit understands"):
+        load_calibration(tmp_path / "c.json", (640, 480))

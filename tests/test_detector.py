@@ -1,4 +1,10 @@
-"""Mask R-CNN and what surrounds it: operators, weights, training, novel objects, detections in files, commands."""
+"""Mask R-CNN and what surrounds it: operators, weights, training, novel objects, detections in files, commands.
+
+Detections in files. Accepted: BOP's list, COCO's map, a map by picture; boxes x, y, width, height; run lengths as text
+or numbers, polygons; numbers as text; names in any capitals. Warned about and skipped: an entry that cannot be used.
+Warned about and read: boxes that only fit as x0, y0, x1, y1. Refused: other files, and those without an entry for the
+picture, its scene or the mesh.
+"""
 
 from __future__ import annotations
 
@@ -321,6 +327,11 @@ def found_in(folder: Path, data: object, image: str = "000001.png", name: str = 
         ({"segmentation": {"size": [9, 9], "counts": [81]}}, "a mask is 9x9, its picture 80x60"),
         ({"segmentation": {"size": [60, 80], "counts": [-4, 9]}}, "entry 2"),
         ({"segmentation": {"size": [60, 80], "counts": "ä"}}, "neither COCO's run lengths nor polygons"),
+        ({"segmentation": {"size": [60, 80], "counts": [0, 10**9]}}, "fill the 80x60 pixels"),
+        ({"segmentation": {"size": [60, 80], "counts": "0" * 3000}}, "fill the 80x60 pixels"),
+        ({"segmentation": {"size": [60, 80], "counts": "o" * 3000}}, "neither COCO's run lengths nor polygons"),
+        ({"segmentation": [[1e9, 2, 3, 1e9, 5, 6]]}, "none beyond 100000 pixels"),
+        ({"bbox": [10**400, 5, 9, 9]}, "no detection"),
         ({"category_id": "six"}, "entry 2 is skipped"),
         ({"image_id": None}, "entry 2 is skipped"),
     ],
@@ -344,6 +355,25 @@ def test_numbers_may_be_text_and_names_have_any_capitals(tmp_path: Path) -> None
             {"id": 2, "name": "can"}], "annotations": [ENTRY | {"image_id": 77, "category_id": 1},
             ENTRY | {"image_id": 77, "category_id": 2}]}  # fmt: skip
     assert len(found_in(tmp_path, coco, name="cup")) == 1
+
+
+def test_boxes_of_corners_are_noticed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """In a picture of 80x60: as x, y, width, height the second one would reach to 120."""
+    [a, b] = found_in(tmp_path, [{**ENTRY, "bbox": [5, 6, 30, 40]}, {**ENTRY, "score": 0.2, "bbox": [50, 10, 70, 55]}])
+    assert (a.box, b.box) == ((5, 6, 30, 40), (50, 10, 70, 55))
+    assert "lie within it as x0, y0, x1, y1: they are taken for the latter" in caplog.text
+    caplog.clear()
+    [c, d] = found_in(tmp_path, [{**ENTRY, "bbox": [5, 6, 30, 40]}, {**ENTRY, "score": 0.2, "bbox": [50, 10, 45, 55]}])
+    assert (c.box, d.box) == ((5, 6, 35, 46), (50, 10, 80, 60)) and "the latter" not in caplog.text
+
+
+def test_run_lengths_are_coco_s() -> None:
+    """What pycocotools writes is read, sizes and shapes of all kinds."""
+    rng = np.random.default_rng(0)
+    for width, height in ((1, 1), (5, 3), (64, 48), (300, 200)):
+        for share in (0.0, 0.02, 0.5, 1.0):
+            mask = rng.random((height, width)) < share
+            assert np.array_equal(decode(encode(mask), (width, height)), mask)
 
 
 def test_what_a_file_has_instead_is_said(tmp_path: Path) -> None:

@@ -1,4 +1,11 @@
-"""Meshes from files of every kind, their units, symmetries, normals, and what is refused."""
+"""Meshes from files of every kind, their units, symmetries, normals, and what is refused.
+
+Accepted: PLY, OBJ, STL, GLB and glTF; polygons, concave ones too; colours of vertices, faces and materials in whatever
+numbers; textures of 8 and 16 bits in the mesh's folder, moved by KHR_texture_transform; units mm, cm, m, in. Told:
+units that were guessed, colours that are not understood, an STL with a wrong count. Refused: what is missing, empty,
+damaged, without faces, compressed, a polygon that crosses itself, vertices that are not finite or beyond 1e12, files
+named by it that are not there or lie elsewhere, more than POSEKIT_MOST_FACES or POSEKIT_MOST_MESH_BYTES.
+"""
 
 from __future__ import annotations
 
@@ -541,7 +548,9 @@ def test_meshes_without_a_surface(tmp_path: Path) -> None:
 def test_vertices_that_are_no_numbers(tmp_path: Path, bad: float) -> None:
     vertices = CORNERS.copy()
     vertices[3, 1] = bad
-    with pytest.raises(MeshError, match=r"has 1 vertices that are NaN or infinite \(the first is number 3\)"):
+    with pytest.raises(
+        MeshError, match=r"has 1 vertices that are NaN, infinite or beyond 1e\+12 \(the first is number 3\)"
+    ):
         ObjectModel.load(write_ply(tmp_path / "box.ply", vertices, FACES))
 
 
@@ -770,3 +779,63 @@ def test_the_note_on_units_says_the_size(tmp_path: Path, caplog: pytest.LogCaptu
     size = np.asarray(BOX.vertices) * 27 / np.linalg.norm((0.10, 0.06, 0.04))
     ObjectModel.load(write_ply(tmp_path / "b.ply", size, FACES))
     assert "the object is 27 mm long" in caplog.text and "--units cm makes it 27 cm" in caplog.text
+
+
+def textured_glb(path: Path, moved: dict[str, object] | None, picture: bytes | None = None) -> None:
+    """A quad from trimesh, its colour texture moved, or replaced by another PNG."""
+    scene = trimesh.Scene()
+    scene.add_geometry(quad(plain_picture((200, 0, 0)), 0.0), geom_name="a")
+    data = scene.export(file_type="glb")
+    length = int.from_bytes(data[12:16], "little")
+    document, buffer = json.loads(data[20 : 20 + length]), data[28 + length :]
+    if moved is not None:
+        texture = document["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
+        texture["extensions"] = {"KHR_texture_transform": moved}
+        document["extensionsUsed"] = ["KHR_texture_transform"]
+    if picture is not None:
+        start = len(buffer) + -len(buffer) % 4
+        buffer = buffer.ljust(start, b"\0") + picture
+        document["bufferViews"].append({"buffer": 0, "byteOffset": start, "byteLength": len(picture)})
+        document["images"][0] = {"bufferView": len(document["bufferViews"]) - 1, "mimeType": "image/png"}
+        document["buffers"][0]["byteLength"] = len(buffer)
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    buffer += bytes(-len(buffer) % 4)
+    chunks = len(text).to_bytes(4, "little") + b"JSON" + text + len(buffer).to_bytes(4, "little") + b"BIN\0" + buffer
+    path.write_bytes(b"glTF" + (2).to_bytes(4, "little") + (12 + len(chunks)).to_bytes(4, "little") + chunks)
+
+
+def test_texture_transforms_are_applied(tmp_path: Path) -> None:
+    textured_glb(tmp_path / "plain.glb", None)
+    textured_glb(tmp_path / "moved.glb", {"offset": [0.5, 0.25], "scale": [0.5, 0.1]})
+    textured_glb(tmp_path / "turned.glb", {"rotation": np.pi / 2})
+    plain, moved, turned = (ObjectModel.load(tmp_path / f"{name}.glb").uvs for name in ("plain", "moved", "turned"))
+    assert plain is not None and moved is not None and turned is not None
+    u, v = plain[:, 0], 1 - plain[:, 1]  # as the file has them, v down
+    np.testing.assert_allclose(moved, np.stack([0.5 + 0.5 * u, 1 - (0.25 + 0.1 * v)], axis=1), atol=1e-6)
+    np.testing.assert_allclose(turned, np.stack([v, 1 + u], axis=1), atol=1e-6)
+
+
+def test_a_transform_that_cannot_be_applied_is_told(tmp_path: Path) -> None:
+    textured_glb(tmp_path / "a.glb", {"offset": "left"})
+    with pytest.raises(MeshError, match="its texture transform cannot be applied"):
+        ObjectModel.load(tmp_path / "a.glb")
+
+
+def test_an_embedded_texture_of_twelve_bits_in_sixteen(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    deep = np.full((8, 8, 3), (0, 2048, 4095), np.uint16)  # OpenCV's order
+    textured_glb(tmp_path / "a.glb", None, cv2.imencode(".png", deep)[1].tobytes())
+    texture = ObjectModel.load(tmp_path / "a.glb").texture
+    assert texture is not None and texture[0, 0].tolist() == [255, 128, 0]
+    assert "they are taken for 12 bits" in caplog.text
+
+
+def test_limits_of_meshes_can_be_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.ply"
+    trimesh.creation.icosphere(2, 0.1).export(path)
+    monkeypatch.setenv("POSEKIT_MOST_FACES", "100")
+    with pytest.raises(MeshError, match=r"a\.ply has 320 faces, at most 100 are read.*set POSEKIT_MOST_FACES"):
+        ObjectModel.load(path)
+    monkeypatch.setenv("POSEKIT_MOST_MESH_BYTES", "1000")
+    with pytest.raises(MeshError, match="set POSEKIT_MOST_MESH_BYTES"):
+        ObjectModel.load(path)

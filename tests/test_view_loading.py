@@ -1,4 +1,13 @@
-"""Photographs, masks, boxes and cameras from files, and every way in which they are refused."""
+"""Photographs, masks, boxes and poses from files, and every way in which they are refused.
+
+Photographs. Accepted: PNG, JPEG, TIFF, BMP, WebP, GIF's first picture, grey, palette, CMYK, transparent, 8 and 16 bits,
+turned by EXIF. Warned about: 10 and 12 bits in a file of 16, damaged EXIF data, a baseline JPEG that lacks a few of its
+last rows, a camera that nobody knows. Refused: what is missing, empty, no picture, damaged, cut off further up, of
+floating-point numbers, under 16 pixels a side or over POSEKIT_MOST_PIXELS.
+Masks. Accepted: any picture, white where the object is, brighter than half. Warned about: values in between, what looks
+inverted. Refused: labels, another size than the photograph's, nothing in it.
+Poses. Accepted: T_cam_obj in metres or its 4x4 numbers alone, a result.json, BOP's pair in mm. Refused: all else.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +22,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from posekit.errors import CameraError, ImageError, PromptError
-from posekit.load import camera_from_exif, load_camera, load_image, load_mask, load_view, parse_box
+from posekit.errors import CameraError, ConfigError, ImageError, PromptError
+from posekit.load import camera_from_exif, load_camera, load_image, load_mask, load_pose, load_view, parse_box
 
 PIXELS = np.random.default_rng(0).integers(0, 256, size=(48, 64, 3), dtype=np.uint8)
 SIZE = (64, 48)
@@ -94,7 +103,7 @@ def test_not_an_image(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["png", "jpg", "bmp", "tif", "webp"])
-@pytest.mark.parametrize("share", [0.02, 0.5, 0.98])
+@pytest.mark.parametrize("share", [0.02, 0.5, 0.8])
 def test_truncated_pictures_are_not_half_decoded(tmp_path: Path, suffix: str, share: float) -> None:
     path = tmp_path / f"a.{suffix}"
     Image.fromarray(PIXELS).save(path)
@@ -473,3 +482,64 @@ def test_the_camera_given_comes_before_exif_and_the_guess(tmp_path: Path, caplog
     assert "a field of view of 60 degrees is assumed" in caplog.text
     assert caplog.records[0].levelno == logging.WARNING
     np.testing.assert_array_equal(view.image, PIXELS)
+
+
+def test_a_jpeg_cut_short_at_its_very_end_is_read_and_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    pixels = np.random.default_rng(0).integers(0, 255, (400, 300, 3), np.uint8)
+    path = tmp_path / "a.jpg"
+    Image.fromarray(pixels).save(path, quality=95)
+    whole, data = load_image(path), path.read_bytes()
+    path.write_bytes(data[:-60])
+    found = load_image(path)
+    assert np.array_equal(found[:380], whole[:380])
+    assert "the file is cut off at its end" in caplog.text
+    path.write_bytes(data[: len(data) * 8 // 10])
+    with pytest.raises(ImageError, match="it is cut off: of 400 rows the last"):
+        load_image(path)
+
+
+def test_the_limit_of_pixels_can_be_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = png(tmp_path / "a.png")
+    monkeypatch.setenv("POSEKIT_MOST_PIXELS", "100")
+    with pytest.raises(ImageError, match="or set POSEKIT_MOST_PIXELS"):
+        load_image(path)
+    monkeypatch.setenv("POSEKIT_MOST_PIXELS", "many")
+    with pytest.raises(ConfigError, match="POSEKIT_MOST_PIXELS=many: give a whole number"):
+        load_image(path)
+
+
+def test_a_pose_as_a_bare_matrix(tmp_path: Path) -> None:
+    matrix = np.eye(4)
+    matrix[:3, 3] = (0.1, 0.2, 0.9)
+    (tmp_path / "p.json").write_text(json.dumps(matrix.tolist()))
+    np.testing.assert_allclose(load_pose(tmp_path / "p.json").matrix, matrix)
+    (tmp_path / "p.json").write_text("[[1, 2], [3]]")
+    with pytest.raises(PromptError, match="holds no pose"):
+        load_pose(tmp_path / "p.json")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        json.dumps({"T_cam_obj": [[10**400, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]]}),
+        json.dumps({"cam_R_m2c": [1, 0, 0, 0, 1, 0, 0, 0, 1], "cam_t_m2c": [0, 0, 10**400]}),
+        "[" * 100_000,
+    ],
+    ids=["matrix", "bop", "deep"],
+)
+def test_poses_of_numbers_or_depths_that_python_cannot_have(text: str, tmp_path: Path) -> None:
+    (tmp_path / "p.json").write_text(text)
+    with pytest.raises(PromptError, match="holds no pose"):
+        load_pose(tmp_path / "p.json")
+
+
+def test_a_mask_whose_pixels_are_damaged_though_its_checksums_are_right(tmp_path: Path) -> None:
+    data = bytearray(png(tmp_path / "m.png").read_bytes())
+    start = data.index(b"IDAT")
+    length = int.from_bytes(data[start - 4 : start], "big")
+    for k in range(start + 20, start + 60):
+        data[k] ^= 0xFF
+    data[start + 4 + length : start + 8 + length] = zlib.crc32(data[start : start + 4 + length]).to_bytes(4, "big")
+    (tmp_path / "m.png").write_bytes(data)
+    with pytest.raises(PromptError, match="is damaged or cannot be read"):
+        load_mask(tmp_path / "m.png")

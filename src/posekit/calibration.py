@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -30,6 +31,7 @@ FORMS = (
 )
 MOST_BYTES = 20_000_000  # a scene_camera.json of 100 000 pictures is smaller
 _MOST_NUMBERS = 1000
+_MOST_YAML, _DEEPEST = 300_000, 50  # letters and brackets: its parser takes seconds for more
 _FAR = 0.12  # of a side, from the middle to the principal point
 
 # Keys are compared in lower case, without anything but letters and digits.
@@ -92,9 +94,22 @@ def load_calibration(source: str | Path, size: Size, image: str | Path | None = 
         return _on_picture(camera, coefficients, model, size, path.name)
     except CameraError as error:
         raise CameraError(str(error) if str(error).startswith(path.name) else f"{path.name}: {error}") from error
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
         reason = " ".join(str(error).split())[:200]
         raise CameraError(f"{path.name} holds no camera that posekit understands ({reason}): give {FORMS}.") from error
+
+
+def calibration_of_entry(entry: Any, size: Size, label: str) -> Calibration:
+    """The camera and the lens of a picture of ``size`` (width, height) from its entry in a BOP scene_camera.json.
+
+    label: what errors call it. Raises CameraError, also where distortion is there and cannot be read.
+    """
+    try:
+        return _on_picture(*_understood(entry, size), size, label)
+    except CameraError as error:
+        raise CameraError(f"{label}: {error}") from error
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
+        raise CameraError(f"{label} holds no camera ({' '.join(str(error).split())[:200]}).") from error
 
 
 def depends_on_picture(source: str | Path) -> bool:
@@ -150,12 +165,19 @@ def _parsed(content: str, path: Path) -> Any:
     if start == "{" or (start == "[" and suffix == ".json"):
         return json.loads(content)
     if start == "%" or suffix in (".yml", ".yaml"):
+        if len(content) > _MOST_YAML or _depth(content) > _DEEPEST:
+            raise ValueError(f"as YAML it is longer than {_MOST_YAML} letters or deeper than {_DEEPEST} brackets")
         content = re.sub(r"\A\s*%YAML.*\n", "", content)  # OpenCV's own form of this line is none of YAML's
         try:
             return yaml.load(content, Loader=_Yaml)
         except yaml.YAMLError as error:
             raise ValueError(f"it is no YAML: {error}") from error
     return [float(part) for part in re.split(r"[\s,;\[\]]+", content) if part]
+
+
+def _depth(text: str) -> int:
+    """How many brackets are open at once, at most."""
+    return max(accumulate((letter in "[{") - (letter in "]}") for letter in text if letter in "[]{}"), default=0)
 
 
 def _xml(element: ElementTree.Element) -> Any:

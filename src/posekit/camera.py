@@ -44,7 +44,7 @@ class Camera:
         """K: (3, 3) or 9 numbers, row by row."""
         try:
             k = np.asarray(K, dtype=np.float64).reshape(3, 3)
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, OverflowError) as error:
             raise CameraError(f"a camera matrix has 3x3 numbers: {error}") from error
         return cls(float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2]), width, height)
 

@@ -37,6 +37,21 @@ def user_cache(name: str) -> Path:
     return (Path(root) if root else Path.home() / ".cache") / "posekit" / name
 
 
+def check_writable(folder: Path, trouble: str) -> None:
+    """Whether a file can be made in a folder, or the folder in the nearest one that is there: by trying. Raises
+    OutputError."""
+    there = folder
+    while not there.exists() and there != there.parent:
+        there = there.parent
+    try:
+        if not there.is_dir():
+            raise NotADirectoryError(20, f"{there} is a file")
+        with tempfile.TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        raise OutputError(f"{trouble}: {error.strerror}. Choose another place, or change its permissions.") from error
+
+
 def write_text_atomic(path: Path, text: str) -> None:
     """As `write_bytes_atomic`, UTF-8."""
     write_bytes_atomic(path, text.encode("utf-8"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import logging
 import math
@@ -19,6 +20,7 @@ from posekit.calibration import Calibration, load_calibration
 from posekit.camera import Box, Camera
 from posekit.errors import CameraError, ImageError, InputError, PromptError
 from posekit.geometry import Pose, nearest_rotation
+from posekit.limits import limit
 from posekit.pixels import deep_colour, eight_bit, upright
 from posekit.pose_formats import pose_from_mapping, pose_from_text
 from posekit.view import View
@@ -30,7 +32,8 @@ Size = tuple[int, int]
 ASSUMED_FOV = math.radians(60.0)  # of the longer side, where nothing says what the camera was
 SMALLEST_SIDE = 16
 FAR = 50.0  # metres: a given pose beyond them is probably in other units
-MOST_PIXELS = 100_000_000
+_BLOCK = 16  # rows of pixels that a JPEG codes together, of which the last decoded ones may be a part
+_MOST_LOST = 0.05  # of a JPEG's rows that may be missing at its end
 
 _FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
 
@@ -72,7 +75,8 @@ def load_image(path: str | Path) -> NDArray[np.uint8]:
 
     Grey and palette pictures become RGB, transparent parts black. 16 bits become 8 by the range that is used: 10 or 12
     bits in a file of 16 are seen by their largest value, and said. Damaged EXIF data do not stop a good picture.
-    Raises ImageError where the file is missing, no picture, damaged, smaller than 16 pixels or over 100 megapixels.
+    Raises ImageError where the file is missing, no picture, damaged, smaller than 16 pixels or over 100 megapixels
+    (POSEKIT_MOST_PIXELS). A JPEG that lacks a few of its last rows alone is read, and told.
     """
     path = Path(path)
     with _opened(path, "picture", ImageError) as image:
@@ -128,25 +132,46 @@ def _opened(path: Path, what: str, kind: type[InputError]) -> Iterator[Image.Ima
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of the size, which is checked here, and of metadata
             with Image.open(path) as probe:
-                if probe.width * probe.height > MOST_PIXELS:
+                if probe.width * probe.height > limit("POSEKIT_MOST_PIXELS"):
                     raise kind(_too_large(path, f"{probe.width}x{probe.height} pixels"))
                 probe.verify()  # for PNG all checksums, which decoding alone does not need
             with Image.open(path) as image:
-                image.load()
-                yield image
+                try:
+                    image.load()
+                    whole: Image.Image = image
+                except OSError as error:
+                    whole = _cut_short(path, image, error)
+                yield whole
     except UnidentifiedImageError as error:
         raise kind(
             f"the {what} {path} is not a picture that posekit reads: give a PNG, JPEG, TIFF, BMP or WebP."
         ) from error
     except Image.DecompressionBombError as error:
         raise kind(_too_large(path, "far more pixels")) from error
-    except (OSError, ValueError, SyntaxError, EOFError, IndexError) as error:
+    except (OSError, ValueError, SyntaxError, EOFError, IndexError, TypeError, OverflowError, KeyError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise kind(f"the {what} {path} is damaged or cannot be read ({reason}): make or copy it again.") from error
 
 
+def _cut_short(path: Path, image: Image.Image, error: OSError) -> Image.Image:
+    """A baseline JPEG whose file ends a little early, as OpenCV reads it, which is told. Raises the given error
+    for other pictures, and OSError where more than a few rows are missing."""
+    if image.format not in ("JPEG", "MPO") or image.info.get("progressive"):
+        raise error
+    found = Image.open(io.BytesIO(path.read_bytes() + b"\xff\xd9"))  # the marker of its end
+    found.load()
+    values = np.asarray(found.convert("L"), dtype=np.int16)
+    filled: NDArray[np.bool_] = np.abs(np.diff(values, axis=1)).max(axis=1) <= 1  # rows of one grey
+    lost = int(np.argmin(filled[::-1])) if not filled.all() else len(filled)
+    if lost + _BLOCK > _MOST_LOST * len(filled):
+        raise OSError(f"it is cut off: of {len(filled)} rows the last {lost + _BLOCK} or so are missing")
+    log.warning("%s: the file is cut off at its end: its last rows of pixels may be grey. Copy it again.", path.name)
+    return found
+
+
 def _too_large(path: Path, given: str) -> str:
-    return f"{path.name} has {given}: at most {MOST_PIXELS // 1_000_000} megapixels are read. Scale it down."
+    most = limit("POSEKIT_MOST_PIXELS") / 1e6
+    return f"{path.name} has {given}: at most {most:g} megapixels are read. Scale it down, or set POSEKIT_MOST_PIXELS."
 
 
 def _exif(image: Image.Image) -> dict[int, Any]:
@@ -278,7 +303,7 @@ def load_camera(source: str | Path, size: Size, image: str | Path | None = None)
 def load_pose(path: str | Path) -> Pose:
     """``T_cam_obj`` (metres) from a JSON or text file.
 
-    JSON: ``{"T_cam_obj": 4x4}`` in metres, a posekit result (its first estimate), what
+    JSON: ``{"T_cam_obj": 4x4}`` or the 4x4 numbers alone in metres, a posekit result (its first estimate), what
     `posekit.pose_formats.pose_from_mapping` reads, and BOP's ``cam_R_m2c`` with ``cam_t_m2c`` in mm. Text: what
     `posekit.pose_formats.pose_from_text` reads, a 4x4 matrix or x y z qx qy qz qw, metres. Raises PromptError where the
     file is missing or something else.
@@ -290,10 +315,11 @@ def load_pose(path: str | Path) -> Pose:
     )
     try:
         text = path.read_text(encoding="utf-8-sig")
-        pose = _pose_from_json(json.loads(text), path, needed) if "{" in text else pose_from_text(text)
+        in_json = text.lstrip().startswith(("{", "["))
+        pose = _pose_from_json(json.loads(text), path, needed) if in_json else pose_from_text(text)
     except OSError as error:
         raise PromptError(f"the pose file {path} cannot be read ({error.strerror}): check the path.") from error
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         reason = f"it has no {error.args[0]}" if isinstance(error, KeyError) else str(error)
         raise PromptError(f"{path} holds no pose ({reason}): {needed}") from error
     if float(np.linalg.norm(pose.t)) > FAR:
@@ -306,6 +332,8 @@ def _pose_from_json(data: Any, path: Path, needed: str) -> Pose:
         if not data["estimates"]:
             raise PromptError(f"the result {path} has no estimates, so there is no pose to start from: {needed}")
         data = data["estimates"][0]
+    if isinstance(data, list):
+        return Pose.from_matrix(data)
     if not isinstance(data, dict):
         raise ValueError("its outermost part is not {...}")
     if "T_cam_obj" in data:

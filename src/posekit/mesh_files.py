@@ -2,37 +2,33 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import re
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from posekit.errors import MeshError
+from posekit.gltf_files import gltf_put_right
 from posekit.polygons import triangulated
 
 log = logging.getLogger("posekit")
 
 _CHANNELS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
-_COMPRESSED = {
-    "KHR_draco_mesh_compression": "Draco",
-    "EXT_meshopt_compression": "meshopt",
-    "KHR_meshopt_compression": "meshopt",
-}
 
 
-def put_right(kind: str, data: bytes, label: str) -> bytes:
-    """A file's bytes as trimesh reads them rightly. kind: its suffix with the dot. Raises MeshError."""
+def put_right(kind: str, data: bytes, label: str, fetch: Callable[[str], bytes]) -> bytes:
+    """A file's bytes as trimesh reads them rightly. kind: its suffix with the dot. fetch: gives the bytes of a file
+    that it names. Raises MeshError."""
     if kind == ".obj":
         return _obj(data, label)
     if kind == ".stl":
         return _stl(data, label)
     if kind in (".glb", ".gltf"):
-        _refuse_compressed(kind, data, label)
+        return gltf_put_right(kind, data, label, fetch)
     return data
 
 
@@ -139,25 +135,6 @@ def _stl(data: bytes, label: str) -> bytes:
 def _is_ascii_stl(data: bytes) -> bool:
     head = data[:1024].lstrip().lower()
     return head.startswith(b"solid") and (b"facet" in head or b"endsolid" in data.lower()[-200:])
-
-
-# --- glTF -------------------------------------------------------------------------------------------------------
-
-
-def _refuse_compressed(kind: str, data: bytes, label: str) -> None:
-    """Raises MeshError where the geometry is compressed in a way that cannot be read here."""
-    try:
-        length = struct.unpack_from("<I", data, 12)[0] if kind == ".glb" else 0
-        document = json.loads(data[20 : 20 + length] if kind == ".glb" else data)
-        used = {*document.get("extensionsUsed", ()), *document.get("extensionsRequired", ())}
-    except (ValueError, struct.error, AttributeError, TypeError):
-        return  # trimesh says what is wrong
-    for extension, name in _COMPRESSED.items():
-        if extension in used:
-            raise MeshError(
-                f"{label} is compressed with {name}, which posekit does not read: export it without compression "
-                f"(in Blender leave out Compression; or gltf-transform copy {label} plain.glb), or as PLY."
-            )
 
 
 # --- PLY --------------------------------------------------------------------------------------------------------

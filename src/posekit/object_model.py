@@ -24,6 +24,7 @@ from scipy.spatial.distance import pdist
 
 from posekit.errors import MeshError
 from posekit.geometry import Pose, fibonacci_sphere, hat, rotation_angle, so3_exp
+from posekit.limits import limit
 from posekit.mesh_files import ply_colours, ply_faces, put_right
 from posekit.pixels import deep_colour, eight_bit
 
@@ -35,6 +36,7 @@ UNITS = {"mm": 0.001, "cm": 0.01, "m": 1.0, "in": 0.0254}
 
 _METRES_BELOW, _MM_ABOVE = 3.0, 20.0  # diameters in a file's own units; between them nobody can tell
 _SMALLEST, _LARGEST = 0.001, 10.0  # diameters in metres that are an object's
+_FARTHEST = 1e12  # of a vertex from the origin, in a file's own units
 _CREASE = np.cos(np.deg2rad(40.0))  # faces that meet more sharply are not smoothed together
 _PLAIN = (153, 153, 153)  # the renderer's colour where a mesh has none
 _TEXTURE_LIMIT = 8192  # pixels, the longer side that any OpenGL takes
@@ -504,10 +506,11 @@ def _checked(label: str, vertices: NDArray[Any], faces: NDArray[Any]) -> tuple[F
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
         raise MeshError(f"{label}: vertices are (V, 3) and faces (F, 3), not {vertices.shape} and {faces.shape}.")
     v, f = vertices.astype(np.float64), faces.astype(np.int64)
-    bad = ~np.isfinite(v).all(axis=1)
+    bad = ~(np.abs(v) < _FARTHEST).all(axis=1)
     if bad.any():
         raise MeshError(
-            f"{label} has {bad.sum()} vertices that are NaN or infinite (the first is number {bad.argmax()}): "
+            f"{label} has {bad.sum()} vertices that are NaN, infinite or beyond {_FARTHEST:g} (the first is number "
+            f"{bad.argmax()}): "
             "repair it, or export it again."
         )
     if f.min() < 0 or f.max() >= len(v):
@@ -563,6 +566,7 @@ class _Assets(trimesh.resolvers.FilePathResolver):
                 "or export the mesh without materials"
             )
             raise FileNotFoundError(name)
+        _check_bytes(found)
         data = found.read_bytes()
         if found.suffix.lower() in (".mtl", ".bin"):
             return data
@@ -614,6 +618,7 @@ def _read(path: Path) -> list[_Part]:
         given = f"the extension {kind}" if kind else "no extension"
         raise MeshError(f"{path.name} has {given}: posekit reads {', '.join(FORMATS)}. Convert it to one of these.")
     try:
+        _check_bytes(path)
         data = path.read_bytes()
     except OSError as error:
         raise MeshError(f"the mesh {path} cannot be read: {error.strerror}.") from error
@@ -622,7 +627,7 @@ def _read(path: Path) -> list[_Part]:
     assets = _Assets(path)
     try:
         loaded = trimesh.load(
-            io.BytesIO(put_right(kind, data, path.name)),
+            io.BytesIO(put_right(kind, data, path.name, assets.get)),
             file_type=kind[1:],
             resolver=assets,
             process=False,
@@ -639,6 +644,16 @@ def _read(path: Path) -> list[_Part]:
     if problem:
         raise MeshError(f"{path.name} {problem}.")
     return parts
+
+
+def _check_bytes(path: Path) -> None:
+    """Raises MeshError where a file is too large to be read."""
+    most, size = limit("POSEKIT_MOST_MESH_BYTES"), path.stat().st_size
+    if size > most:
+        raise MeshError(
+            f"{path.name} has {size / 1e6:.0f} MB, at most {most / 1e6:.0f} MB are read: simplify the mesh, or set "
+            "POSEKIT_MOST_MESH_BYTES."
+        )
 
 
 def _reading_options(path: Path, data: bytes) -> dict[str, Any]:
@@ -660,6 +675,11 @@ def _parts(scene: trimesh.Scene, label: str) -> list[_Part]:
         else:
             points += len(getattr(geometry, "vertices", ()))
     parts = [part for part in parts if len(part.vertices)]
+    most, faces = limit("POSEKIT_MOST_FACES"), sum(len(part.faces) for part in parts)
+    if faces > most:
+        raise MeshError(
+            f"{label} has {faces} faces, at most {most} are read: simplify the mesh, or set POSEKIT_MOST_FACES."
+        )
     if not parts and points:
         raise MeshError(
             f"{label} has {points} points and no faces: posekit renders surfaces, so it needs a triangle mesh."

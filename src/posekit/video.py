@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from posekit.calibration import Calibration, depends_on_picture, load_calibration
+from posekit.calibration import Calibration, calibration_of_entry, depends_on_picture, load_calibration
 from posekit.camera import Camera
 from posekit.errors import ImageError, InputError, OutputError
 from posekit.load import ASSUMED_FOV, camera_from_exif, load_image
@@ -67,18 +67,21 @@ class Frames(Protocol):
 def open_frames(source: str, camera: str | Path | None = None) -> Frames:
     """A source of frames by its name.
 
-    source: a video file, a folder of pictures, a glob of them, a BOP scene (a folder with scene_camera.json), or the
-    number of a camera. camera: as `load_calibration` takes it; else a BOP scene's own, else a picture's EXIF data, else
-    a field of view of 60 degrees. Pictures come in the order of the numbers in their names.
+    source: a video file, a folder of pictures, a glob of them, a BOP scene (a folder with scene_camera.json, or of
+    several sensors the file scene_camera_SENSOR.json), or the number of a camera. camera: as `load_calibration` takes
+    it; else a BOP scene's own, else a picture's EXIF data, else a field of view of 60 degrees. Pictures come in the
+    order of the numbers in their names.
     Raises InputError where there is no such thing or nothing in it, ImageError where a video cannot be opened.
     """
     if source.isdigit() and not Path(source).exists():
         return CameraFrames(int(source), camera)
     path = Path(source)
     if path.is_dir():
-        if (path / "scene_camera.json").is_file():
-            return SceneFrames(path)
+        if cameras := sorted(path.glob("scene_camera*.json")):
+            return SceneFrames(_only(cameras))
         return PictureFrames(_pictures(path.iterdir(), source), camera)
+    if path.is_file() and re.fullmatch(r"scene_camera(_.+)?\.json", path.name):
+        return SceneFrames(path)
     if path.is_file():
         return PictureFrames([path], camera) if path.suffix.lower() in PICTURES else VideoFrames(path, camera)
     if glob.has_magic(source):
@@ -86,6 +89,17 @@ def open_frames(source: str, camera: str | Path | None = None) -> Frames:
     raise InputError(
         f"there is no {source}: give a video, a folder or glob of pictures, a BOP scene, or a camera's number."
     )
+
+
+def _only(cameras: list[Path]) -> Path:
+    """The file of a scene's cameras. Raises InputError where it is one sensor's of several."""
+    plain = [path for path in cameras if path.stem == "scene_camera"]
+    if not plain and len(cameras) > 1:
+        raise InputError(
+            f"{cameras[0].parent} has the pictures of several sensors: give the file of one, {cameras[0]} or "
+            f"{', '.join(path.name for path in cameras[1:])}."
+        )
+    return (plain or cameras)[0]
 
 
 def _pictures(paths: Any, source: str) -> list[Path]:
@@ -159,33 +173,38 @@ class SceneFrames:
 
     rate = RATE
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, file: Path) -> None:
+        """file: scene_camera.json, or a sensor's."""
         try:
-            cameras = json.loads((folder / "scene_camera.json").read_text(encoding="utf-8-sig"))
+            cameras = json.loads(file.read_text(encoding="utf-8-sig"))
             self.cameras: Mapping[int, Any] = {int(k): v for k, v in sorted(cameras.items(), key=lambda kv: int(kv[0]))}
-        except (OSError, ValueError, AttributeError) as error:
-            raise InputError(f"{folder / 'scene_camera.json'} cannot be read: {error}.") from error
-        self.folder, self.count = folder, len(self.cameras)
-        self.scene = int(folder.name) if folder.name.isdigit() else 0
+        except (OSError, ValueError, AttributeError, RecursionError) as error:
+            raise InputError(f"{file} cannot be read: {error}.") from error
+        self.file, self.folder, self.count = file, file.parent, len(self.cameras)
+        self.scene = int(self.folder.name) if re.fullmatch(r"[0-9]+", self.folder.name) else 0
         if not self.count:
-            raise InputError(f"{folder / 'scene_camera.json'} names no pictures.")
+            raise InputError(f"{file} names no pictures.")
 
     def __iter__(self) -> Iterator[Frame]:
         for place, (number, entry) in enumerate(self.cameras.items()):
             try:
                 path = self._path(number)
                 image = load_image(path)
-                camera = Camera.from_K(np.reshape(entry["cam_K"], (3, 3)), image.shape[1], image.shape[0])
-                yield Frame(number, image, camera, None, place / self.rate, scene=self.scene, file=path.name)
-            except (InputError, KeyError, ValueError, TypeError) as error:
+                label = f"{self.file.name}, image {number}"
+                found = calibration_of_entry(entry, (image.shape[1], image.shape[0]), label)
+                valid = None if found.lens is None else found.lens.valid
+                yield Frame(number, found.undistorted(image), found.ideal, valid, place / self.rate, scene=self.scene,
+                            file=path.name)  # fmt: skip
+            except InputError as error:
                 yield Frame(number, None, problem=str(error), scene=self.scene)
 
     def _path(self, number: int) -> Path:
         names = dict.fromkeys((f"{number:06d}", str(number)))
-        for path in (self.folder / k / (n + s) for n in names for k in ("rgb", "gray") for s in PICTURES):
+        ending = self.file.stem.removeprefix("scene_camera")
+        for path in (self.folder / (k + ending) / (n + s) for n in names for k in ("rgb", "gray") for s in PICTURES):
             if path.is_file():
                 return path
-        raise ImageError(f"the scene {self.folder} has no picture {number:06d} in rgb.")
+        raise ImageError(f"the scene {self.folder} has no picture {number:06d} in rgb{ending}.")
 
 
 class VideoFrames:

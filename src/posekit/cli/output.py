@@ -9,14 +9,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
 
 import typer
 
 from posekit.cli.options import NOT_RELIABLE
 from posekit.errors import OutputError
-from posekit.files import write_bytes_atomic, write_text_atomic
+from posekit.files import check_writable, write_bytes_atomic, write_text_atomic
 from posekit.geometry import rotation_angle
 from posekit.pose_formats import NamedPose, check_formats, pose_files
 from posekit.results import Estimate
@@ -46,7 +45,7 @@ class OutputFolder:
             raise OutputError(f"{self.path} is a file: --out names a folder.")
         if occupied and not self.force:
             raise OutputError(f"the folder {self.path} holds files: pass --force to write into it, or another --out.")
-        _check_writable(self.path, f"the output folder {self.path} cannot be written")
+        check_writable(self.path, f"the output folder {self.path} cannot be written")
 
     @classmethod
     def chosen(cls, out: Path | None, default: Path, force: bool) -> OutputFolder:
@@ -83,21 +82,6 @@ def _occupied(folder: Path) -> bool:
         raise OutputError(f"the output folder {folder} cannot be read: {error.strerror}.") from error
 
 
-def _check_writable(folder: Path, trouble: str) -> None:
-    """Whether a file can be made in a folder, or the folder in the nearest one that is there: by trying. Raises
-    OutputError."""
-    there = folder
-    while not there.exists() and there != there.parent:
-        there = there.parent
-    try:
-        if not there.is_dir():
-            raise NotADirectoryError(20, f"{there} is a file")
-        with TemporaryFile(dir=there):
-            pass
-    except OSError as error:
-        raise OutputError(f"{trouble}: {error.strerror}. Choose another place, or change its permissions.") from error
-
-
 @dataclass(frozen=True)
 class Destination:
     """What ``--out``, ``--force`` and ``--json`` ask for, checked before any work is done.
@@ -119,7 +103,7 @@ class Destination:
                 raise OutputError(f"--json {json} is a folder: give a file, or - for standard output.")
             if not Path(json).parent.is_dir():
                 raise OutputError(f"--json {json}: there is no folder {Path(json).parent}. Make it first.")
-            _check_writable(Path(json).parent, f"--json {json} cannot be written")
+            check_writable(Path(json).parent, f"--json {json} cannot be written")
         check_formats(formats)
         if out is None and json is not None:
             if set(formats) - {"json"}:

@@ -89,7 +89,9 @@ def synth(
         if not given:
             raise ConfigError("a data set needs meshes: pass --models DIR or --models FILE.")
         from posekit.data.synth.objects import read_objects
+        from posekit.data.synth.run import check_new
 
+        check_new(out)
         objects = read_objects(given, units, symmetry)
         count = images or (PER_OBJECT * len(objects) if kind == "randomised" else DEFAULT)
         config = SynthConfig(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from posekit.cli.options import ForceOption, Units
+from posekit.files import check_writable
 
 if TYPE_CHECKING:
     from posekit.train.config import TrainConfig
@@ -103,6 +104,7 @@ def pose(
     """Train the pose networks on renderings of your meshes, or of procedural shapes where none are given."""
     from posekit.train.pose import resume_pose, train_pose
 
+    check_writable(out, f"the output folder {out} cannot be written")
     if resume:
         with _bar() as show:
             rows = resume_pose(out, show)
@@ -147,6 +149,7 @@ def angle(
     from posekit.train.config import changed, default_config
     from posekit.train.pose import calibrate_angle
 
+    check_writable(out, f"the output folder {out} cannot be written")
     asked = {
         "calibrate": cases, "stream": {"share": share},
         "sources": {"models": _texts(model), "meshes": _texts(meshes), "units": units,
@@ -291,6 +294,7 @@ def detector(
     from posekit.train.config import changed
     from posekit.train.detector import default_config, read_config, resume_detector, train_detector
 
+    check_writable(out, f"the output folder {out} cannot be written")
     if resume:
         with _bar() as show:
             rows = resume_detector(out, show)

@@ -18,15 +18,20 @@ import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
 
+from posekit.calibration import calibration_of_entry
 from posekit.camera import Box, Camera
 from posekit.errors import CameraError, ImageError, InputError, MeshError
 from posekit.geometry import Pose
 from posekit.load import load_image, load_mask, pose_from_bop
-from posekit.object_model import ObjectModel
+from posekit.object_model import UNITS, ObjectModel
 from posekit.view import View
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 _MESHES = (".ply", ".obj", ".glb", ".gltf", ".stl")
+_JSON_KINDS: dict[type, str] = {dict: "map", list: "list"}
+_UNIT_NAMES = {"m": "metres", "cm": "centimetres", "in": "inches"}
+_NEAREST_MM = 10.0  # of a scene's farthest object
+_DOUBTFUL_MM = 3.0  # a diameter that is more likely one in metres
 
 log = logging.getLogger("posekit")
 
@@ -78,15 +83,19 @@ class Target:
 class BopDataset:
     """A folder in BOP layout: ``models/``, ``SPLIT/SCENE/{rgb, scene_camera.json, ...}``.
 
-    split: the folder with scenes. targets: a test's list of images and objects, by default the first
-    ``SPLIT_targets_*.json`` (bop19 before others) in the folder; where there is one, `images` and `instances` keep
-    to it. Pass ``targets=None`` to see everything. Raises InputError where the layout is not there.
+    split: the folder with scenes; ``test:photoneo`` where a scene has the pictures of several sensors
+    (``scene_camera_photoneo.json``, ``rgb_photoneo/``); the only sensor needs no name. targets: a test's list of
+    images and objects, by default the first ``SPLIT_targets_*.json`` (bop19 before others) in the folder; where there
+    is one, `images` and `instances` keep to it. Pass ``targets=None`` to see everything. Raises InputError where the
+    layout is not there.
     """
 
     def __init__(
         self, root: str | Path, split: str = "test", targets: str | None = "auto", models: str = "models"
     ) -> None:
+        split, _, sensor = split.partition(":")
         self.root, self.split, self.name = Path(root), split, Path(root).resolve().name
+        self.sensor = sensor or None
         if not (self.root / split).is_dir():
             raise InputError(
                 f"{self.root} has no folder {split!r}: a data set in BOP layout has models/ and {split}/000001/ and so "
@@ -114,16 +123,16 @@ class BopDataset:
             if path is None:
                 wanted = self._models / f"obj_{obj_id:06d}.ply"
                 raise MeshError(f"there is no mesh {wanted} for object {obj_id}; there are {self.model_ids()}.")
-            self._loaded[obj_id] = _mesh(path)
+            self._loaded[obj_id] = _mesh(path, _stated(path.parent / "models_info.json", obj_id))
         return self._loaded[obj_id]
 
     def measured_model(self, obj_id: int) -> MeasuredModel:
         """What an object's errors are measured with: the mesh in models_eval/ where there is one, as BOP does."""
         if obj_id not in self._measured:
             fine = _meshes(self.root / "models_eval").get(obj_id)
-            model = self.model(obj_id) if fine is None else _mesh(fine)
-            folder = self._models if fine is None else fine.parent
-            self._measured[obj_id] = MeasuredModel(model, _diameter(folder / "models_info.json", obj_id, model))
+            info = (self._models if fine is None else fine.parent) / "models_info.json"
+            model = self.model(obj_id) if fine is None else _mesh(fine, _stated(info, obj_id))
+            self._measured[obj_id] = MeasuredModel(model, _diameter(info, obj_id, model))
         return self._measured[obj_id]
 
     def scenes(self) -> list[int]:
@@ -148,7 +157,7 @@ class BopDataset:
             if entries and not any("obj_id" in entry for entry in entries):
                 return self._all_of(entries)
             return [Target(*(int(e[k]) for k in ("scene_id", "im_id", "obj_id", "inst_count"))) for e in entries]
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise InputError(
                 f"{self._targets_file} is no list of targets with scene_id, im_id, obj_id and inst_count: {error!r}."
             ) from error
@@ -170,9 +179,9 @@ class BopDataset:
 
     def image_path(self, scene: int, image: int) -> Path:
         """Where a photograph lies. Raises InputError where it is missing."""
-        folder = self._scene(scene).folder
+        folder, ending = self._scene(scene).folder, self._scene(scene).ending
         names = list(dict.fromkeys((f"{image:06d}", str(image), f"{image:04d}", f"{image:05d}")))
-        candidates = [folder / kind / (n + s) for n in names for kind in ("rgb", "gray") for s in _SUFFIXES]
+        candidates = [folder / (kind + ending) / (n + s) for n in names for kind in ("rgb", "gray") for s in _SUFFIXES]
         found = next((path for path in candidates if path.is_file()), None)
         if found is None:
             raise InputError(
@@ -192,22 +201,32 @@ class BopDataset:
     def depth(self, scene: int, image: int) -> NDArray[np.float32] | None:
         """The sensor's depth (H, W), metres, 0 where it saw nothing; None where the data set has none."""
         here = self._scene(scene)
-        candidates = [here.folder / "depth" / f"{image:06d}{suffix}" for suffix in (".png", ".tif")]
+        candidates = [here.folder / f"depth{here.ending}" / f"{image:06d}{suffix}" for suffix in (".png", ".tif")]
         path = next((candidate for candidate in candidates if candidate.is_file()), None)
         if path is None:
             return None
         raw = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if raw is None or raw.ndim != 2:
             raise ImageError(f"the depth image {path} is damaged or has several channels: copy it again.")
-        scale = float(here.cameras.get(image, {}).get("depth_scale", 1.0))
+        try:
+            scale = float(here.cameras.get(image, {}).get("depth_scale", 1.0))
+        except (TypeError, ValueError, OverflowError) as error:
+            raise InputError(f"{here.file('scene_camera')}, image {image}: its depth_scale is no number.") from error
         return np.asarray(raw, dtype=np.float32) * np.float32(scale / 1000.0)
 
     def camera(self, scene: int, image: int, size: tuple[int, int]) -> Camera:
         """A photograph's camera; size: (width, height). Raises CameraError."""
         here = self._scene(scene)
         if image not in here.cameras:
-            raise CameraError(f"{here.folder}/scene_camera.json has no camera for image {image}.")
-        return Camera.from_K(here.cameras[image]["cam_K"], *size)
+            raise CameraError(f"{here.file('scene_camera')} has no camera for image {image}.")
+        label = f"{here.file('scene_camera')}, image {image}"
+        found = calibration_of_entry(here.cameras[image], size, label)
+        if found.lens is not None:
+            raise CameraError(
+                f"{label}: its picture has lens distortion, while a data set's masks, boxes and measures are those of "
+                "a pinhole camera: undistort the pictures and masks, and leave the distortion out."
+            )
+        return found.camera
 
     def instances(self, scene: int, image: int, every: bool = False) -> list[Instance]:
         """The annotated objects in a photograph, in the file's order.
@@ -217,12 +236,12 @@ class BopDataset:
         """
         here = self._scene(scene)
         if image not in here.truths:
-            raise InputError(f"{here.folder}/scene_gt.json has no annotations for image {image}.")
+            raise InputError(f"{here.file('scene_gt')} has no annotations for image {image}.")
         truths = here.truths[image]
         infos = here.infos.get(image, []) if here.infos is not None else [None] * len(truths)
         if len(infos) != len(truths):
             raise InputError(
-                f"{here.folder}/scene_gt_info.json has {len(infos)} entries for image {image}, scene_gt.json "
+                f"{here.file('scene_gt_info')} has {len(infos)} entries for image {image}, scene_gt.json "
                 f"{len(truths)}: they belong together. Get both from the same copy of the data set."
             )
         found = [_instance(here, scene, image, k, truths[k], infos[k]) for k in range(len(truths))]
@@ -242,7 +261,7 @@ class BopDataset:
             folder = next((p for p in sorted(split.iterdir()) if _number(p.name) == scene and p.is_dir()), None)
             if folder is None:
                 raise InputError(f"there is no scene {split / f'{scene:06d}'}; there are {self.scenes()}.")
-            self._scenes[scene] = _Scene(folder)
+            self._scenes[scene] = _Scene(folder, self.sensor)
         return self._scenes[scene]
 
     def _find_targets(self, targets: str | None) -> Path | None:
@@ -258,29 +277,63 @@ class BopDataset:
 
 
 class _Scene:
-    """A scene's files, each read when it is first needed."""
+    """A scene's files, each read when it is first needed. sensor: of several, whose files end in its name.
 
-    def __init__(self, folder: Path) -> None:
+    Raises InputError where there are several and none is chosen.
+    """
+
+    def __init__(self, folder: Path, sensor: str | None = None) -> None:
         self.folder = folder
+        there = sorted(path.stem[len("scene_camera_") :] for path in folder.glob("scene_camera_*.json"))
+        if sensor is None and len(there) > 1 and not (folder / "scene_camera.json").is_file():
+            raise InputError(
+                f"{folder} has the pictures of the sensors {', '.join(there)}: choose one, as --split "
+                f"{folder.parent.name}:{there[0]}."
+            )
+        if sensor is not None and sensor not in there:
+            raise InputError(f"{folder} has no sensor {sensor!r}; there are {', '.join(there) or 'none with names'}.")
+        alone = there[0] if there and not (folder / "scene_camera.json").is_file() else None
+        self.ending = f"_{sensor or alone}" if sensor or alone else ""
+
+    def file(self, name: str) -> Path:
+        return self.folder / f"{name}{self.ending}.json"
 
     @cached_property
     def cameras(self) -> dict[int, Any]:
-        return self._numbered("scene_camera.json")
+        return self._numbered("scene_camera", dict)
 
     @cached_property
     def truths(self) -> dict[int, Any]:
-        return self._numbered("scene_gt.json")
+        found = self._numbered("scene_gt", list)
+        _check_millimetres(self.file("scene_gt"), found)
+        return found
 
     @cached_property
     def infos(self) -> dict[int, Any] | None:
-        name = "scene_gt_info.json"
-        return self._numbered(name) if (self.folder / name).exists() else None
+        return self._numbered("scene_gt_info", list) if self.file("scene_gt_info").exists() else None
 
-    def _numbered(self, name: str) -> dict[int, Any]:
-        data = _json(self.folder / name)
-        if not isinstance(data, dict) or not all(key.isdigit() for key in data):
-            raise InputError(f"{self.folder / name} does not map image numbers to entries, as BOP's files do.")
+    def _numbered(self, name: str, kind: type) -> dict[int, Any]:
+        path = self.file(name)
+        data = _json(path)
+        if not isinstance(data, dict) or not all(_number(key) is not None for key in data):
+            raise InputError(f"{path} does not map image numbers to entries, as BOP's files do.")
+        wrong = next((key for key, value in data.items() if not isinstance(value, kind)), None)
+        if wrong is not None:
+            raise InputError(f"{path}, image {wrong}: its entry is no {_JSON_KINDS[kind]}, as BOP's files have there.")
         return {int(key): value for key, value in data.items()}
+
+
+def _check_millimetres(path: Path, truths: Mapping[int, Any]) -> None:
+    """Raises InputError where all objects would be within a centimetre of the camera: metres were written."""
+    try:
+        far = [math.hypot(*map(float, truth["cam_t_m2c"])) for entries in truths.values() for truth in entries]
+    except (KeyError, TypeError, ValueError, OverflowError):
+        return  # told where the entry is read
+    if far and max(far) < _NEAREST_MM:
+        raise InputError(
+            f"{path}: cam_t_m2c is in mm, and its objects would be at most {max(far):.3g} mm from the camera: it seems "
+            "to be in metres; multiply it by 1000."
+        )
 
 
 def _instance(
@@ -296,9 +349,9 @@ def _instance(
             box_obj=None if info is None else _box(info["bbox_obj"]),
             box_visib=None if info is None else _box(info["bbox_visib"]),
             visib_fract=math.nan if info is None else float(info["visib_fract"]),
-            mask_path=scene.folder / "mask_visib" / f"{image:06d}_{index:06d}.png",
+            mask_path=scene.folder / f"mask_visib{scene.ending}" / f"{image:06d}_{index:06d}.png",
         )
-    except (KeyError, ValueError, TypeError) as error:
+    except (KeyError, ValueError, TypeError, OverflowError) as error:
         raise InputError(f"annotation {index} of image {image} in {scene.folder} is not BOP's: {error!r}.") from error
 
 
@@ -311,18 +364,37 @@ def _box(xywh: Any) -> Box | None:
     return (x, y, x + w + 1, y + h + 1) if w >= 0 and h >= 0 else None
 
 
-def _diameter(info: Path, obj_id: int, model: ObjectModel) -> float:
-    """As the data set states it, else measured. Raises InputError where what is stated is no length."""
-    entry = _json(info).get(str(obj_id), {}) if info.is_file() else {}
+def _stated(info: Path, obj_id: int) -> float | None:
+    """The diameter of models_info.json, in its mm; None without one. Raises InputError where it is no length."""
+    every = _json(info) if info.is_file() else {}
+    entry = every.get(str(obj_id), {}) if isinstance(every, dict) else None
+    if not isinstance(entry, dict):
+        raise InputError(f"{info} does not map the objects' numbers to entries, as BOP's models_info.json does.")
     if "diameter" not in entry:
-        return model.diameter
+        return None
     try:
-        diameter = float(entry["diameter"]) / 1000.0
-    except (TypeError, ValueError):
+        diameter = float(entry["diameter"])
+    except (TypeError, ValueError, OverflowError):
         diameter = math.nan
     if not 0 < diameter < math.inf:
         raise InputError(f"{info} gives object {obj_id} the diameter {entry['diameter']!r}: it is a number of mm.")
     return diameter
+
+
+def _diameter(info: Path, obj_id: int, model: ObjectModel) -> float:
+    """Metres, as the data set states it, else measured; measured too, and told, where it was stated in metres. Raises
+    InputError where what is stated is no length."""
+    stated = _stated(info, obj_id)
+    if stated is not None and _alike(stated, model.diameter):
+        log.warning("%s: the diameter %g of object %d is in metres, not in BOP's mm; it is measured.", info, stated,
+                    obj_id)  # fmt: skip
+        stated = None
+    return model.diameter if stated is None else stated / 1000.0
+
+
+def _alike(a: float, b: float) -> bool:
+    """Diameters of one object, measured by two programs."""
+    return 0.95 < a / b < 1.05
 
 
 def _number(name: str) -> int | None:
@@ -341,25 +413,35 @@ def _meshes(folder: Path) -> dict[int, Path]:
     return found
 
 
-def _mesh(path: Path) -> ObjectModel:
-    """A mesh in BOP's millimetres; in metres where it could not be an object otherwise, which is told."""
-    try:
-        return ObjectModel.load(path, units="mm")
-    except MeshError as error:
-        model = _in_metres(path)
-        if model is None:
+def _mesh(path: Path, stated: float | None) -> ObjectModel:
+    """A mesh in BOP's millimetres; in another unit, which is told, where that alone gives an object or the stated
+    diameter (mm, None where nothing states it). Raises MeshError."""
+    found: dict[str, ObjectModel] = {}
+    for unit in ("mm", "m", "cm", "in"):
+        try:
+            found[unit] = ObjectModel.load(path, units=unit)
+        except MeshError as error:
+            if "posekit works" not in str(error):
+                raise
             reason = str(error).partition("; posekit works")[0]
-            raise MeshError(f"{reason}. The meshes of a data set in BOP layout are in mm: scale it.") from error
-    log.warning("%s: BOP's meshes are in mm, which would make it %.3g mm long; it is taken for metres.", path.name,
-                model.diameter)  # fmt: skip
+        if unit == "mm" and unit in found and (stated is None or _alike(1000 * found[unit].diameter, stated)):
+            break  # as it is meant
+    fitting = [u for u, m in found.items() if stated is not None and _alike(1000 * m.diameter, stated)]
+    chosen = next(iter(fitting or [u for u in ("mm", "m") if u in found]), None)
+    if chosen is None:
+        raise MeshError(f"{reason}. The meshes of a data set in BOP layout are in mm: scale it.")
+    model = found[chosen]
+    inside = 1000 * model.diameter
+    if chosen != "mm":
+        log.warning("%s: BOP's meshes are in mm, which would make it %.3g mm long; it is taken for %s, %.4g mm long.",
+                    path.name, inside / (1000 * UNITS[chosen]), _UNIT_NAMES[chosen], inside)  # fmt: skip
+    elif stated is not None and not fitting and not _alike(model.diameter, stated):
+        log.warning("%s: it is %.4g mm long, and models_info.json says %.4g: measures use the latter.", path.name,
+                    inside, stated)  # fmt: skip
+    elif stated is None and inside < _DOUBTFUL_MM:
+        log.warning("%s: it is %.3g mm long, as BOP's meshes are in mm; where it is in metres, scale it by 1000.",
+                    path.name, inside)  # fmt: skip
     return model
-
-
-def _in_metres(path: Path) -> ObjectModel | None:
-    try:
-        return ObjectModel.load(path, units="m")
-    except MeshError:
-        return None
 
 
 def _json(path: Path) -> Any:
@@ -367,5 +449,5 @@ def _json(path: Path) -> Any:
         return json.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError as error:
         raise InputError(f"there is no file {path}: this copy of the data set is not complete.") from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path} cannot be read: {error}.") from error

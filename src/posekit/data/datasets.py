@@ -162,7 +162,7 @@ def open_dataset(name: str | None, root: Path | None, split: str | None = None) 
     if name is None:
         assert root is not None
         known = DATASETS.get(root.resolve().name)
-        if known is None or not (root / (split or known.split)).is_dir():
+        if known is None or not (root / (split or known.split).partition(":")[0]).is_dir():
             data = BopDataset(root, split or "test")
             return data, DatasetInfo(data.name, data.name, tuple(data.model_ids()), own_names(root))
         name = known.name

@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 
 from posekit.data.datasets import DatasetInfo
 from posekit.errors import InputError, OutputError
-from posekit.files import write_text_atomic
+from posekit.files import check_writable, write_text_atomic
 
 OWNER = "bop-benchmark"
 _DONE = ".posekit-download"
@@ -44,6 +44,8 @@ def download(info: DatasetInfo, folder: Path, *, endpoint: str | None = None, ke
         archives.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"the folder {target} cannot be made: {error.strerror}. Pass --root DIR.") from error
+    for place in (target, archives):
+        check_writable(place, f"the folder {place} cannot be written")
     fetched = []
     for name in info.archives:
         marker = target / f"{_DONE}-{name}"

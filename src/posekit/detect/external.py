@@ -21,6 +21,8 @@ from posekit.view import View
 
 log = logging.getLogger("posekit")
 
+_BEYOND = 1.1  # of a picture's side: a box that ends further out is no width and height
+
 _FORMS = (
     "a list of {image_id, category_id, score, bbox: [x, y, width, height], segmentation} as BOP and COCO results have "
     "it, or COCO's {images, annotations, categories}"
@@ -50,7 +52,7 @@ class DetectionsFile:
         try:
             every, names, files = _parts(data)
             entries = [e for k, e in enumerate(every) if _usable(e, k, path.name)]
-        except (KeyError, TypeError, AttributeError, ValueError) as error:
+        except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
             raise PromptError(f"{path} holds no detections ({error!r}): give {_FORMS}.") from error
         if every and not entries:
             raise PromptError(f"{path} has {len(every)} entries and none that can be used: give {_FORMS}.")
@@ -79,7 +81,8 @@ class DetectionsFile:
                     raise PromptError(text)
                 log.warning("%s", text)
             chosen = [(k, e) for k, e in enumerate(self.entries) if int(e["category_id"]) in wanted]
-            mine = [d for k, e in chosen if (d := self._told(k, e, view, model)) is not None]
+            corners = self._corners(view)
+            mine = [d for k, e in chosen if (d := self._told(k, e, view, model, corners)) is not None]
             if chosen and not mine:
                 raise PromptError(f"{self.label}: none of its {len(chosen)} detections of {model.name} can be used.")
             found += sorted(mine, key=lambda d: -d.score)
@@ -88,21 +91,38 @@ class DetectionsFile:
     def _categories(self, numbers: set[int]) -> str:
         return ", ".join(f"{n} ({self.names[n]})" if n in self.names else str(n) for n in sorted(numbers))
 
-    def _told(self, k: int, entry: Mapping[str, Any], view: View, model: ObjectModel) -> Detection | None:
+    def _corners(self, view: View) -> bool:
+        """Whether all boxes of the picture are x0, y0, x1, y1, which is told: so they lie within it, and some do not as
+        x, y, width, height."""
+        width, height = (view.camera if view.lens is None else view.lens.camera).size
+        boxes = [e["bbox"] for e in self.entries if _four(e.get("bbox"))]
+        inside = all(x0 < x1 <= width + 1 and y0 < y1 <= height + 1 for x0, y0, x1, y1 in boxes)
+        beyond = any(x + w > _BEYOND * width or y + h > _BEYOND * height for x, y, w, h in boxes)
+        if inside and beyond:
+            log.warning(
+                "%s: its boxes go beyond the picture of %dx%d pixels as x, y, width, height, and lie within it as "
+                "x0, y0, x1, y1: they are taken for the latter. COCO and BOP have the former: correct the file.",
+                self.label, width, height,
+            )  # fmt: skip
+        return inside and beyond
+
+    def _told(
+        self, k: int, entry: Mapping[str, Any], view: View, model: ObjectModel, corners: bool
+    ) -> Detection | None:
         """The detection, or None where it cannot be used, which is told."""
         try:
-            return self._detection(entry, view, model)
+            return self._detection(entry, view, model, corners)
         except PromptError as error:
             log.warning("%s: entry %d for this picture is skipped: %s", self.label, k + 1, error)
             return None
 
-    def _detection(self, entry: Mapping[str, Any], view: View, model: ObjectModel) -> Detection:
+    def _detection(self, entry: Mapping[str, Any], view: View, model: ObjectModel, corners: bool) -> Detection:
         try:
             score = float(entry.get("score", 1.0))
             taken = view.camera if view.lens is None else view.lens.camera
             mask = decode(entry["segmentation"], taken.size) if entry.get("segmentation") else None
-            box = _box(entry["bbox"]) if entry.get("bbox") is not None else None
-        except (KeyError, TypeError, ValueError) as error:
+            box = _box(entry["bbox"], corners) if entry.get("bbox") is not None else None
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise PromptError(f"{self.label} has an entry that is no detection ({error!r}): give {_FORMS}.") from error
         if mask is not None and not mask.any():
             mask = None
@@ -133,7 +153,7 @@ def _usable(entry: Any, k: int, label: str) -> bool:
         int(entry["category_id"]), int(entry["image_id"])
         if entry.get("scene_id") is not None:
             int(entry["scene_id"])
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         reason = f"it has no {error}" if isinstance(error, KeyError) else str(error)
         log.warning("%s: entry %d is skipped: %s.", label, k + 1, reason)
         return False
@@ -186,9 +206,14 @@ def model_number(name: str) -> int | None:
     return int(found[1]) if found else None
 
 
-def _box(values: Sequence[float]) -> Box:
+def _four(values: Any) -> bool:
+    return isinstance(values, list) and len(values) == 4 and all(type(v) in (int, float) for v in values)
+
+
+def _box(values: Sequence[float], corners: bool) -> Box:
+    """corners: whether they are x0, y0, x1, y1, else x, y, width, height."""
     x, y, width, height = (float(v) for v in values)
-    return x, y, x + width, y + height
+    return (x, y, width, height) if corners else (x, y, x + width, y + height)
 
 
 def categories_of(names: Sequence[str]) -> dict[str, int]:

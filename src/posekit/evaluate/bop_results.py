@@ -217,6 +217,9 @@ def read_detections(
     return found
 
 
+_LARGEST = 1e300  # integers beyond are no floats
+
+
 def _region(path: Path, line: int, entry: Any) -> FoundRegion:
     def refuse(reason: str) -> InputError:
         return InputError(f"{path}, line {line}: {reason}. Correct the file.")
@@ -226,13 +229,16 @@ def _region(path: Path, line: int, entry: Any) -> FoundRegion:
     missing = [k for k in ("scene_id", "image_id", "category_id", "score", "bbox") if k not in entry]
     if missing:
         raise refuse(f"{', '.join(missing)} missing")
-    ids = [entry[k] for k in ("scene_id", "image_id", "category_id")]
+    ids = [
+        int(v) if isinstance(v, str) and v.isascii() and v.isdigit() else v
+        for v in (entry[k] for k in ("scene_id", "image_id", "category_id"))
+    ]
     if not all(type(v) is int for v in ids):
         raise refuse(f"scene_id, image_id and category_id are whole numbers, not {ids}")
     box, score, seconds = entry["bbox"], entry["score"], entry.get("time", -1.0)
     if not isinstance(box, list) or len(box) != 4:
         raise refuse("bbox has four numbers, x, y, width and height")
-    if not all(type(v) in (int, float) and math.isfinite(v) for v in (*box, score, seconds)):
+    if not all(type(v) in (int, float) and abs(v) < _LARGEST for v in (*box, score, seconds)):
         raise refuse("bbox, score and time are finite numbers")
     x, y, w, h = box
     if w <= 0 or h <= 0:

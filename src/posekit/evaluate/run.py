@@ -15,7 +15,7 @@ import numpy as np
 from posekit import metrics
 from posekit._version import __version__
 from posekit.data.datasets import Dataset, DatasetInfo, open_dataset
-from posekit.errors import ConfigError
+from posekit.errors import ConfigError, OutputError
 from posekit.evaluate import table
 from posekit.evaluate.bop_results import ResultRow, csv_name, read_results, results_csv
 from posekit.evaluate.options import EvalOptions
@@ -26,7 +26,7 @@ from posekit.evaluate.store import RunFolder
 from posekit.evaluate.truths import TruthReader, pictures, selected
 from posekit.evaluate.vsd import VsdMeter
 from posekit.evaluate.workers import run_pictures
-from posekit.files import write_text_atomic
+from posekit.files import check_writable, write_text_atomic
 from posekit.geometry import Pose
 from posekit.nets.weights import load_networks
 
@@ -59,6 +59,9 @@ def evaluate(
     data set has depth. progress: called with the numbers of finished and of all pictures.
     Raises ConfigError, InputError, OutputError and what the stages raise.
     """
+    if out.exists() and not out.is_dir():
+        raise OutputError(f"{out} is a file: --out names a folder.")
+    check_writable(out, f"the output folder {out} cannot be written")
     data, info = open_dataset(options.dataset, options.root, options.split)
     wanted = pictures(data, options)
     if not wanted:

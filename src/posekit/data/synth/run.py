@@ -27,7 +27,7 @@ from posekit.data.synth.plan import CONFIG, Maker, SynthConfig
 from posekit.data.synth.report import write_report
 from posekit.data.synth.shards import write_shards
 from posekit.errors import ConfigError, OutputError, PosekitError
-from posekit.files import write_text_atomic
+from posekit.files import check_writable, write_text_atomic
 from posekit.object_model import ObjectModel
 from posekit.render import Renderer
 
@@ -48,12 +48,20 @@ class Machines:
             raise ConfigError(f"{self.workers} workers: at least 1 is needed.")
 
 
+def check_new(root: Path) -> None:
+    """Raises OutputError where a new data set cannot be written there."""
+    if root.exists() and not root.is_dir():
+        raise OutputError(f"{root} is a file: --out names a folder.")
+    if root.is_dir() and any(root.iterdir()):
+        raise OutputError(f"the folder {root} holds files: pass --resume to go on with its data set, or another --out.")
+    check_writable(root, f"the output folder {root} cannot be written")
+
+
 def begin(config: SynthConfig, root: Path, models: Mapping[int, ObjectModel]) -> None:
     """Write the models and the configuration of a new data set into an empty or new folder."""
     if not models:
         raise ConfigError("a synthetic data set needs objects: pass --models.")
-    if root.is_dir() and any(root.iterdir()):
-        raise OutputError(f"the folder {root} holds files: pass --resume to go on with its data set, or another --out.")
+    check_new(root)
     write_models(root, models)
     names = {str(obj_id): model.name for obj_id, model in sorted(models.items())}
     _write_json(root / NAMES, names)
