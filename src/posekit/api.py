@@ -24,7 +24,7 @@ from posekit.lens import Lens
 from posekit.load import ASSUMED_FOV, load_mask, load_view
 from posekit.object_model import ObjectModel
 from posekit.results import Detection, Estimate, estimates_to_json
-from posekit.search import SearchOptions, estimate_instances
+from posekit.search import find_instances
 from posekit.view import View
 
 log = logging.getLogger("posekit")
@@ -136,11 +136,8 @@ def estimate(
         mesh = model if isinstance(model, ObjectModel) else ObjectModel.load(model, units=units, symmetry=symmetry)
         file = None if weights is None else Path(weights)
         estimator = PoseEstimator(mesh, preset=preset, weights=file, options=options)
-    given = box is not None or mask is not None
-    search = SearchOptions.given(by_hand=True) if given else SearchOptions()
-    return Result(
-        view, estimator, tuple(estimate_instances(estimator, view, _found(view, estimator, box, mask), search))
-    )
+    [found] = find_instances(lambda _: estimator, view, [estimator.model], _found(view, estimator, box, mask))
+    return Result(view, estimator, tuple(found.instances))
 
 
 def result_json(

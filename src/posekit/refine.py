@@ -1,9 +1,9 @@
 """The loop: zoom, render, predict, update; it keeps a trace. Layer 3.
 
 Paper, section 3.3: the pose is updated until SV-Net's own predicted angle falls below 2 degrees; where that does not
-happen within 50 iterations, the iterate with the lowest predicted angle wins. A loop whose predicted angle has not
-fallen for some time ends earlier, which changes almost nothing (docs/decisions/0005). DeepIM's fixed number of
-iterations is the other policy.
+happen within 50 iterations, the iterate with the lowest predicted angle wins. A loop whose pose no longer moves, or
+whose predicted angle has not fallen for some time, ends earlier, which changes almost nothing (docs/decisions/0005).
+DeepIM's fixed number of iterations is the other policy.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from posekit.zoom import zoom_to_pose
 
 UPDATES = ("regression", "correspondence")
 STOPS = ("angle", "fixed")
+RESTING = float(np.deg2rad(0.25))  # of turns, and as a share of the distance: a pose that moves less is at rest
 NEAR = float(np.deg2rad(12.0))  # corrections below which the outline is looked for: further off it is out of reach
 LEAST_SCALE, KNEE = 0.5, 2.5  # pixels, no correspondence is more exact; standard deviations
 TOGETHER = 25.0  # so many correspondences err alike: they count as one against the outline's lines
@@ -231,10 +232,15 @@ class _Loop:
         if options.stop == "angle" and angle < options.stop_angle:
             self.done = self.converged = True
             return
-        if options.stop == "angle" and len(self.steps) - self._lowest() > options.patience:
+        if options.stop == "angle" and (self._rests(updated) or len(self.steps) - self._lowest() > options.patience):
             self.done = True
             return
         self.pose = updated
+
+    def _rests(self, updated: Pose) -> bool:
+        """Whether an update moves the pose by less than it can be known: all further ones would do the same."""
+        turn, shift = pose_change(self.pose, updated)
+        return turn < RESTING and shift < RESTING * float(np.linalg.norm(updated.t))
 
     def _lowest(self) -> int:
         """The step with the lowest predicted angle."""

@@ -21,7 +21,7 @@ from posekit.nets.weights import Networks
 from posekit.object_model import ObjectModel
 from posekit.refine import RefineOptions, refine
 from posekit.render import Renderer
-from posekit.results import Detection
+from posekit.results import Detection, Source
 from posekit.view import View
 
 ITERATIONS = 4
@@ -66,7 +66,7 @@ def rendered_cases(source: CaseSource, renderer: Renderer, count: int, seed: int
             others.append(scene.rgba)
             view = view_of(picture, scene.camera)
             truth = scene.T_view_ctr @ shown.T_obj_ctr.inverse()
-            detection = Detection(disturbed_box(scene.box, config, rng), mask=view.mask, source="rendered")
+            detection = Detection(disturbed_box(scene.box, config, rng), mask=view.mask, source=Source.MASK)
             cases.append(_case(view, known, truth, detection, rng))
     return cases
 
@@ -81,7 +81,7 @@ def bop_cases(dataset: BopDataset, count: int) -> list[Case]:
         mask = instance.mask()
         if mask.any() and instance.box_visib is not None:
             view = dataset.view(instance.scene, instance.image).with_mask(mask)
-            detection = Detection(instance.box_visib, mask=mask, source="truth")
+            detection = Detection(instance.box_visib, mask=mask, source=Source.MASK)
             cases.append(_case(view, dataset.model(instance.obj_id), instance.T_cam_obj, detection, rng))
     return cases
 
