@@ -78,16 +78,6 @@ def test_the_angle_is_that_of_the_pose_which_is_told(networks: Networks) -> None
     assert masked.converged == (masked.contour_std < np.deg2rad(2)) and masked.angle != masked.contour_std
 
 
-def test_refine_lays_outlines_between_its_rounds(networks: Networks, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As estimate does: hypotheses are compared where their outlines lie right."""
-    model, seen = bracket(), []
-    monkeypatch.setattr("posekit.estimate.fit_outline", lambda view, model, pose, *_: seen.append(pose))
-    estimator = oracle(model, TRUTH, networks, iterations=5, contour=False)
-    estimator.predictor = Oracle(model, TRUTH, angles=[0.5])  # type: ignore[assignment]
-    estimator.refine(photograph(model, TRUTH), TRUTH)
-    assert len(seen) == 5 + 1, "the given one and four beside it, then the best"
-
-
 def test_the_paper_preset_needs_no_option(tmp_path: Path) -> None:
     save_networks(tmp_path / "paper", build("paper", PaperConfig((128, 128), 0.125)), {})
     model = bracket()

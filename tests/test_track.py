@@ -29,7 +29,7 @@ from posekit.object_model import ObjectModel
 from posekit.odometry import Look, follow_points, match_texture
 from posekit.recording import Recorder
 from posekit.refine import crops
-from posekit.region import Tint, fit_outline, learn, off_colour, outline_lines
+from posekit.region import Tint, learn, off_colour, outline_lines
 from posekit.render import Renderer
 from posekit.results import Detection, Estimate
 from posekit.track import LOST, RESTARTED, TRACKED, TrackConfig, Tracker
@@ -202,17 +202,6 @@ def test_blurred_edges_do_not_move_the_outline(model: ObjectModel, renderer: Ren
     there = at.drawn.camera.project(at.T_view_ctr.apply(lines.points))
     off = np.einsum("ni,ni->n", lines.places - there, lines.normals)
     assert abs(np.median(off)) < 0.35, "pixels of the crop"
-
-
-def test_a_pose_is_laid_onto_the_outline_that_colours_show(model: ObjectModel, renderer: Renderer) -> None:
-    view = photograph(renderer, model, path(model, 0))
-    for off in (1.0, 2.0):
-        found = fit_outline(view, model, path(model, off), renderer, (160, 120), 0.1)
-        assert found is not None
-        before, after = (pose_error(p, path(model, 0)) for p in (path(model, off), found))
-        assert after[0] < 0.6 * before[0] and after[1] < 0.5 * before[1]
-    flat = View(np.full_like(view.image, 128), CAMERA)
-    assert fit_outline(flat, model, path(model, 0), renderer, (160, 120), 0.1) is None
 
 
 def test_an_outline_is_not_sought_where_the_object_is_hidden(model: ObjectModel, renderer: Renderer) -> None:
