@@ -19,10 +19,10 @@ from posekit.hypotheses import (
     BoxSearch,
     Hypothesis,
     Judge,
-    MVNetSearch,
     agreement_of,
     poses_beside,
 )
+from posekit.mvnet_search import FirstPoseSearch, mvnet_search
 from posekit.nets.predictor import NetworkPredictor
 from posekit.nets.weights import Networks, load_networks
 from posekit.object_model import ObjectModel
@@ -97,10 +97,10 @@ class PoseEstimator:
         self.predictor = NetworkPredictor(self.networks)
         self.refine_options = options.refine_options(self.predictor.dense)
         self.renderer = Renderer()
-        self._search: BoxSearch | MVNetSearch | None = None
+        self._search: BoxSearch | FirstPoseSearch | None = None
         self._features = FeatureSearch(model, self.renderer)
         if options.init == "mvnet":
-            self._search = MVNetSearch(model, self.networks, self.renderer)
+            self._search = mvnet_search(model, self.networks, self.renderer)
 
     @property
     def weights_hash(self) -> str:

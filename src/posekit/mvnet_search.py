@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -12,8 +13,9 @@ from numpy.typing import NDArray
 
 from posekit.camera import Camera, Zoom
 from posekit.geometry import Pose, rotation_angle, rotation_between, so3_exp
-from posekit.hypotheses import Hypothesis
+from posekit.hypotheses import Hypothesis, MVNetSearch
 from posekit.nets.mvnet import CELL, GRID, NONE, VIEW, Encoded, Matches, MatchingMVNet, rgb_input, view_input
+from posekit.nets.weights import Networks
 from posekit.object_model import ObjectModel
 from posekit.pnp import PnpConfig, solve_pnp
 from posekit.render import Renderer
@@ -41,6 +43,14 @@ class MatchingOptions:
     pooled: int = 3
     apart: float = float(np.deg2rad(15.0))
     refine: PnpConfig = PnpConfig(iterations=8, min_points=6)
+
+
+class FirstPoseSearch(Protocol):
+    """Whatever gives first poses for a detection."""
+
+    def search(self, view: View, detection: Detection, count: int) -> list[Hypothesis]:
+        """At most ``count`` ``T_cam_obj``, best first."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +95,13 @@ class _Points:
     def joined(cls, parts: Sequence[_Points]) -> _Points:
         return cls(np.concatenate([p.points for p in parts]), np.concatenate([p.pixels for p in parts]),
                    np.concatenate([p.weight for p in parts]))  # fmt: skip
+
+
+def mvnet_search(model: ObjectModel, networks: Networks, renderer: Renderer) -> FirstPoseSearch:
+    """First poses by the MV-Net that the weights hold, of either preset. Raises WeightsError where they hold none."""
+    if isinstance(networks.mvnet, MatchingMVNet):
+        return MatchingSearch(model, networks.mvnet, renderer)
+    return MVNetSearch(model, networks, renderer)
 
 
 class MatchingSearch:

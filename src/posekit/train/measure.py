@@ -14,8 +14,8 @@ from posekit.data.bop import BopDataset
 from posekit.data.procedural import random_object
 from posekit.data.scenes import SceneConfig, disturbed_box, disturbed_pose, render_scenes, usable_instances, view_of
 from posekit.geometry import Pose
-from posekit.hypotheses import MVNetSearch
 from posekit.metrics import add, pose_error, within
+from posekit.mvnet_search import FirstPoseSearch, mvnet_search
 from posekit.nets.predictor import NetworkPredictor
 from posekit.nets.weights import Networks
 from posekit.object_model import ObjectModel
@@ -109,11 +109,11 @@ def measure(cases: Sequence[Case], networks: Networks, renderer: Renderer) -> di
 
 
 def _first_poses(cases: Sequence[Case], networks: Networks, renderer: Renderer) -> dict[str, float]:
-    searches: dict[int, MVNetSearch] = {}
+    searches: dict[int, FirstPoseSearch] = {}
     turns = []
     for case in cases:
         if id(case.model) not in searches:
-            searches[id(case.model)] = MVNetSearch(case.model, networks, renderer)
+            searches[id(case.model)] = mvnet_search(case.model, networks, renderer)
         found = searches[id(case.model)].search(case.view, case.detection, 1)
         turn = pose_error(found[0].T_cam_obj, case.truth, case.model.symmetries.transforms())[0] if found else np.pi
         turns.append(float(np.rad2deg(turn)))
