@@ -11,7 +11,7 @@ import torch
 from safetensors.torch import load_file
 
 from posekit.camera import Camera
-from posekit.errors import WeightsError
+from posekit.errors import ConfigError, WeightsError
 from posekit.nets.flownet import LAYERS, FlowNetEncoder
 from posekit.nets.heads import PoseHeads, Prediction, compress_angle, expand_angle
 from posekit.nets.inputs import images_to_tensor, relief, to_input
@@ -27,6 +27,8 @@ from posekit.nets.lite import (
 )
 from posekit.nets.losses import Target, dense_loss, matching_loss, mvnet_loss, svnet_loss, true_score
 from posekit.nets.paper import Branch, PaperMVNet, PaperSVNet
+from posekit.nets.precision import choose_device
+from posekit.nets.predictor import NetworkPredictor
 from posekit.nets.rigid import Motion, Surface, exp_so3, induced_flow, solve_motion
 from posekit.nets.weights import PaperConfig, build, find_weights, load_networks, save_networks
 from posekit.view import View
@@ -364,3 +366,29 @@ def test_bad_weights_are_refused(tmp_path: Path) -> None:
         build("huge")
     with pytest.raises(WeightsError, match="ships no trained weights"):
         find_weights("paper")
+
+
+def test_the_device_is_one_that_is_there() -> None:
+    there = torch.cuda.is_available()
+    assert choose_device("cpu") == "cpu" and choose_device("auto") == ("cuda" if there else "cpu")
+    with pytest.raises(ConfigError, match="auto, cpu, cuda"):
+        choose_device("tpu")
+    if not there:
+        with pytest.raises(ConfigError, match="finds no GPU"):
+            choose_device("cuda")
+
+
+def test_networks_compute_where_they_were_moved() -> None:
+    """The meta device computes shapes alone: what is not sent there, or not taken back, fails."""
+    networks = build("lite", SMALL)
+    predictor = NetworkPredictor(networks, bfloat16=False)
+    assert predictor.device.type == "cpu"
+    seen: list[str] = []
+    networks.svnet.register_forward_pre_hook(lambda _, inputs: seen.extend(x.device.type for x in inputs))
+    assert networks.moved("meta").device.type == "meta"
+    moved = NetworkPredictor(networks, bfloat16=False)
+    view = View(np.zeros((48, 64, 3), np.uint8), Camera(60.0, 60.0, 31.5, 23.5, 64, 48))
+    drawn = dataclasses.replace(view, mask=np.ones((48, 64), bool), depth=np.ones((48, 64), np.float32))
+    with pytest.raises(RuntimeError, match="meta"):  # it computes no numbers
+        moved.predict([view], [drawn])
+    assert seen == ["meta"] * 4

@@ -116,6 +116,7 @@ def estimate(
     symmetry: str | None = None,
     preset: str = "lite",
     weights: str | Path | None = None,
+    device: str = "auto",
     options: EstimateOptions = EstimateOptions(),
 ) -> Result:
     """The pose of an object in a photograph.
@@ -135,7 +136,7 @@ def estimate(
     else:
         mesh = model if isinstance(model, ObjectModel) else ObjectModel.load(model, units=units, symmetry=symmetry)
         file = None if weights is None else Path(weights)
-        estimator = PoseEstimator(mesh, preset=preset, weights=file, options=options)
+        estimator = PoseEstimator(mesh, preset=preset, weights=file, options=options, device=device)
     [found] = find_instances(lambda _: estimator, view, [estimator.model], _found(view, estimator, box, mask))
     return Result(view, estimator, tuple(found.instances))
 

@@ -23,6 +23,7 @@ from posekit.hypotheses import (
     poses_beside,
 )
 from posekit.mvnet_search import FirstPoseSearch, mvnet_search
+from posekit.nets.precision import choose_device
 from posekit.nets.predictor import NetworkPredictor
 from posekit.nets.weights import Networks, load_networks
 from posekit.object_model import ObjectModel
@@ -80,7 +81,9 @@ class PoseEstimator:
     """Estimates the pose of one object in photographs.
 
     networks: where several estimators share them, in place of those that preset and weights name; see `Estimators`.
-    Not thread-safe: one estimator per thread. Raises WeightsError where the preset has no weights.
+    device: of the networks: "auto" (a GPU where there is one), "cpu" or "cuda".
+    Not thread-safe: one estimator per thread. Raises WeightsError where the preset has no weights, ConfigError where
+    there is no such device.
     """
 
     def __init__(
@@ -91,9 +94,10 @@ class PoseEstimator:
         weights: Path | None = None,
         options: EstimateOptions = EstimateOptions(),
         networks: Networks | None = None,
+        device: str = "auto",
     ) -> None:
         self.model, self.options = model, options
-        self.networks = load_networks(preset, weights) if networks is None else networks
+        self.networks = load_networks(preset, weights).moved(choose_device(device)) if networks is None else networks
         self.predictor = NetworkPredictor(self.networks)
         self.refine_options = options.refine_options(self.predictor.dense)
         self.renderer = Renderer()
@@ -273,9 +277,14 @@ class Estimators:
     """
 
     def __init__(
-        self, *, preset: str = "lite", weights: Path | None = None, options: EstimateOptions = EstimateOptions()
+        self,
+        *,
+        preset: str = "lite",
+        weights: Path | None = None,
+        options: EstimateOptions = EstimateOptions(),
+        device: str = "auto",
     ) -> None:
-        self.networks, self.options = load_networks(preset, weights), options
+        self.networks, self.options = load_networks(preset, weights).moved(choose_device(device)), options
         self._made: dict[ObjectModel, PoseEstimator] = {}
 
     def __call__(self, model: ObjectModel) -> PoseEstimator:

@@ -403,16 +403,18 @@ class MVNetSearch:
         self.camera, self.distance = frontal_camera(model, networks.size)
         poses = [Pose(R, np.array([0, 0, self.distance])) @ model.T_obj_ctr.inverse() for R in self.rotations]
         views = renderer.render(model, poses, self.camera, coords=False)
-        self.views = torch.from_numpy(np.stack([to_input(v.image, v.mask) for v in views]))
+        self.device = networks.device
+        self.views = torch.from_numpy(np.stack([to_input(v.image, v.mask) for v in views])).to(self.device)
 
     def search(self, view: View, detection: Detection, count: int) -> list[Hypothesis]:
         """One first pose; ``count`` is an upper bound, as for every search. Empty where it lies behind the camera."""
         mask = detection.mask if detection.mask is not None else box_mask(detection.box, view.camera)
         crop = view.with_mask(mask).zoomed(zoom_to_box(view.camera, detection.box, self.size))
-        observed = torch.from_numpy(to_input(crop.image, crop.mask))[None]
+        observed = torch.from_numpy(to_input(crop.image, crop.mask))[None].to(self.device)
         with torch.inference_mode():
             out = self.mvnet(observed, self.views[None])
-        delta = PoseDelta(quat_to_rotation(out.quat_wxyz[0].double().numpy()), out.v[0].double().numpy())
+        quat_wxyz, v = (x[0].double().cpu().numpy() for x in (out.quat_wxyz, out.v))
+        delta = PoseDelta(quat_to_rotation(quat_wxyz), v)
         target = apply_delta(self.frontal(crop.camera), delta, crop.camera.fx)
         if not np.isfinite(target.matrix).all() or target.t[2] < 0.6 * self.model.diameter:
             return []

@@ -399,7 +399,7 @@ def _about(pose: Pose, camera: Camera, spread: tuple[float, float, float]) -> Be
 
 
 def _predictor(estimator: PoseEstimator, config: TrackConfig) -> Predictor:
-    if config.runtime == "torch":
+    if config.runtime == "torch" or estimator.predictor.device.type != "cpu":
         return estimator.predictor
     from posekit.nets.openvino import OpenVinoPredictor
 

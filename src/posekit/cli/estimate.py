@@ -16,6 +16,7 @@ from posekit.cli.options import (
     ContourOption,
     DetectionsOption,
     DetectorOption,
+    DeviceOption,
     ForceOption,
     FormatOption,
     ImageArgument,
@@ -90,6 +91,7 @@ def estimate(
     contour: ContourOption = True,
     outline: OutlineOption = True,
     threads: ThreadsOption = None,
+    device: DeviceOption = "auto",
     out: OutOption = None,
     force: ForceOption = False,
     json: JsonOption = None,
@@ -125,7 +127,7 @@ def estimate(
     with destination.working("detecting"):
         found = finder.detect(view, meshes)
     with destination.working("loading the networks"):
-        estimators = Estimators(preset=preset, weights=weights, options=options)
+        estimators = Estimators(preset=preset, weights=weights, options=options, device=device)
     search = SearchOptions.usual(found)
     search = replace(search, instances=search.instances if asked else instances,
                      least=search.least if least is None else least)  # fmt: skip

@@ -15,6 +15,7 @@ from posekit.cli.options import (
     OUTPUT,
     BesideOption,
     ContourOption,
+    DeviceOption,
     IterationsOption,
     OutlineOption,
     PresetOption,
@@ -95,6 +96,7 @@ def evaluate(
         typer.Option(help="Of the refine stage's disturbances, and of --compare's bootstrap.", rich_help_panel=STAGE),
     ] = 0,
     threads: Annotated[int, typer.Option(min=1, help="Of torch, in each worker.", rich_help_panel=LOOP)] = 1,
+    device: DeviceOption = "auto",
     workers: Annotated[int, typer.Option(min=1, help="Processes.", rich_help_panel=LOOP)] = 1,
     out: Annotated[
         Path | None,
@@ -142,6 +144,7 @@ def evaluate(
         weights=weights,
         estimate=EstimateOptions(init, hypotheses, update, stop, iterations, stop_angle, beside, contour, outline),
         threads=threads,
+        device=device,
         workers=workers,
     )
     name = dataset or (root.resolve().name if root is not None else "data")

@@ -109,6 +109,10 @@ OutlineOption = Annotated[
         rich_help_panel=LOOP,
     ),
 ]
+DeviceOption = Annotated[
+    Literal["auto", "cpu", "cuda"],
+    typer.Option(help="What the networks run on; auto takes a GPU where there is one.", rich_help_panel=LOOP),
+]
 ThreadsOption = Annotated[
     int | None, typer.Option(min=1, help="Threads of torch; by default its own choice.", rich_help_panel=LOOP)
 ]

@@ -14,6 +14,7 @@ from posekit.cli.options import (
     BoxOption,
     CameraOption,
     ContourOption,
+    DeviceOption,
     ForceOption,
     FormatOption,
     ImageArgument,
@@ -66,6 +67,7 @@ def refine(
     contour: ContourOption = True,
     outline: OutlineOption = True,
     threads: ThreadsOption = None,
+    device: DeviceOption = "auto",
     out: OutOption = None,
     force: ForceOption = False,
     json: JsonOption = None,
@@ -100,7 +102,7 @@ def refine(
         [detection] = detector_for(box, mask, mask_from, view.lens).detect(view, [mesh])
         view = view.with_mask(detection.mask)
     with destination.working("loading the networks"):
-        estimator = PoseEstimator(mesh, preset=preset, weights=weights, options=options)
+        estimator = PoseEstimator(mesh, preset=preset, weights=weights, options=options, device=device)
     with destination.working("refining"):
         refined = estimator.refine(view, start)
     destination.deliver(estimator, view, [refined], {"image": image, "mesh": model}, blend)

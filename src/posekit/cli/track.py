@@ -19,6 +19,7 @@ from posekit.cli.options import (
     OUTPUT,
     CameraOption,
     DetectorOption,
+    DeviceOption,
     ForceOption,
     FormatOption,
     ModelsOption,
@@ -88,6 +89,7 @@ def track(
         Literal["openvino", "torch"], typer.Option(help="Of the network.", rich_help_panel=LOOP)
     ] = "openvino",
     threads: ThreadsOption = None,
+    device: DeviceOption = "auto",
     overlay: Annotated[bool, typer.Option(help="Write overlay.mp4.", rich_help_panel=OUTPUT)] = True,
     rerun: Annotated[
         bool, typer.Option("--rerun", help="Write track.rrd for the Rerun viewer.", rich_help_panel=OUTPUT)
@@ -137,7 +139,7 @@ def track(
         from posekit.novel import make_detector
 
         finder, _ = make_detector(detector, meshes, doubtful=True)
-    estimators = Estimators(preset=preset, weights=weights)
+    estimators = Estimators(preset=preset, weights=weights, device=device)
     trackers = [
         Tracker(mesh, pose=start, detector=finder, config=config, estimator=estimators(mesh))
         for mesh, start in zip(meshes, starts, strict=True)

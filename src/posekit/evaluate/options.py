@@ -23,10 +23,9 @@ class EvalOptions:
     """dataset: a known name, or None. root: its folder. objects: numbers, all where empty. images: (scene, image),
     all where empty. limit: that many pictures, spread evenly. min_visible: instances at least as visible, in [0, 1];
     None is the test's own targets. detections: one of GIVEN, DETECTOR or a JSON file. detector: which one, a name or
-    file of weights, as `novel.make_detector` takes it. masks: whether the refiner is given
-    the visible mask. noise: degrees and three cm, standard deviations;
-    seed: of the disturbances. threads: of torch, in each worker; the same
-    whatever the number of workers, since sums depend on it. The rest is EstimateOptions'."""
+    file of weights, as `novel.make_detector` takes it. masks: whether the refiner is given the visible mask. noise:
+    degrees and three cm, standard deviations; seed: of the disturbances. threads: of torch, in each worker; the same
+    whatever the number of workers, since sums depend on it. device: of the networks. The rest is EstimateOptions'."""
 
     stage: str
     dataset: str | None = None
@@ -45,6 +44,7 @@ class EvalOptions:
     weights: Path | None = None
     estimate: EstimateOptions = EstimateOptions()
     threads: int = 1
+    device: str = "auto"
     workers: int = 1
 
     def __post_init__(self) -> None:

@@ -151,7 +151,7 @@ class ImageStage:
     def _estimators_of(self, model: ObjectModel) -> PoseEstimator:
         if self._estimators is None:
             o = self.options
-            self._estimators = Estimators(preset=o.preset, weights=o.weights, options=o.estimate)
+            self._estimators = Estimators(preset=o.preset, weights=o.weights, options=o.estimate, device=o.device)
         return self._estimators(model)
 
     def _estimator(self, obj_id: int) -> PoseEstimator:

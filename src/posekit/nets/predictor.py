@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -66,12 +67,11 @@ class Predictor(Protocol):
 
 
 class NetworkPredictor:
-    """SV-Net through PyTorch. bfloat16: whether to compute in it; None = where the hardware does so faster. device:
-    torch's name of it; the networks are moved there."""
+    """SV-Net through PyTorch, where the networks are (`Networks.moved`). bfloat16: whether to compute in it; None =
+    where the hardware does so faster."""
 
-    def __init__(self, networks: Networks, bfloat16: bool | None = None, device: str = "cpu") -> None:
-        self.networks, self.device = networks, torch.device(device)
-        networks.svnet.to(self.device)
+    def __init__(self, networks: Networks, bfloat16: bool | None = None) -> None:
+        self.networks, self.device = networks, networks.device
         self.bfloat16 = has_fast_bfloat16(self.device.type) if bfloat16 is None else bfloat16
         self.size = networks.size
         self.dense = networks.dense
@@ -85,7 +85,8 @@ class NetworkPredictor:
         if dense:
             inputs.append(np.stack([relief(v) for v in rendered]))
             inputs.append(np.array([v.camera.fx / v.camera.width for v in rendered], np.float32))
-        with torch.inference_mode(), torch.autocast(device.type, torch.bfloat16, enabled=self.bfloat16):
+        lower = torch.autocast(device.type, torch.bfloat16) if self.bfloat16 else nullcontext()
+        with torch.inference_mode(), lower:
             out = svnet(*(torch.from_numpy(array).to(device) for array in inputs))
         arrays = [None if x is None else x.float().cpu().numpy() for x in answers(out)]
         return [unpack(arrays, k, rendered[k]) for k in range(len(observed))]

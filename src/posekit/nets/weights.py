@@ -52,6 +52,18 @@ class Networks:
         return self.config.size
 
     @property
+    def device(self) -> torch.device:
+        """Where the networks are."""
+        return next(self.svnet.parameters()).device
+
+    def moved(self, device: str) -> Networks:
+        """The same networks, moved to a device by torch's name of it."""
+        self.svnet.to(device)
+        if self.mvnet is not None:
+            self.mvnet.to(device)
+        return self
+
+    @property
     def dense(self) -> bool:
         """Whether SV-Net predicts correspondences."""
         return isinstance(self.svnet, LiteSVNet)
