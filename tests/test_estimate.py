@@ -13,7 +13,7 @@ from posekit.data.tabletop import procedural_objects
 from posekit.errors import ConfigError, WeightsError
 from posekit.estimate import EstimateOptions, PoseEstimator, presence, score
 from posekit.geometry import Pose, PoseNoise
-from posekit.hypotheses import Agreement, poses_beside
+from posekit.hypotheses import poses_beside
 from posekit.metrics import pose_error
 from posekit.nets.weights import build, save_networks
 from posekit.refine import pose_change
@@ -176,10 +176,11 @@ def test_what_is_not_there_is_doubted(examples) -> None:
     assert shown.score > 0.8 > 0.4 > absent.score
     [again] = PoseEstimator(other).estimate(example.view, [detection], 1.0)
     assert again.score < 0.5 and again.iterations == 3 and not again.converged, "not refined to the end"
-    usual = presence(Agreement(0.9, 0.5, 0.2), 2.0)
-    assert 0 < presence(Agreement(0.6, 0.5, 0.2), 2.0) < usual < 1
-    assert presence(Agreement(0.9, 0.5, 0.1), 2.0) < usual
-    assert presence(Agreement(0.9, 0.5, 0.2), 4.0) < usual
+    usual = presence(0.2, 2.0, 0.05)
+    assert 0 < presence(0.1, 2.0, 0.05) < usual < 1, "less alike"
+    assert presence(0.2, 4.0, 0.05) < usual, "less exact"
+    assert presence(0.2, 2.0, 0.1) < usual, "further off"
+    assert presence(0.2, 2.0, 0.0) == presence(0.2, 2.0, 1e-3), "no angle is too small"
 
 
 def test_first_poses_come_from_both_masks(examples) -> None:

@@ -15,7 +15,6 @@ from posekit.errors import ConfigError
 from posekit.features import FeatureSearch
 from posekit.geometry import Pose, rotation_angle
 from posekit.hypotheses import (
-    Agreement,
     BoxSearch,
     Hypothesis,
     Judge,
@@ -34,7 +33,8 @@ from posekit.view import View
 
 INITS = ("templates", "mvnet")
 AUTO = "auto"  # correspondences where the network gives them, else the regressed delta
-SILHOUETTE, STRUCTURE, BLUR, BIAS = 4.1, 8.0, 3.0, -2.3  # of `presence`, fitted: docs/decisions/0014
+STRUCTURE, BLUR, ANGLE, BIAS = 4.0, -1.4, -1.6, 1.2  # of `presence`, fitted: docs/decisions/0020
+SMALLEST = 0.3  # degrees: smaller predicted errors say no more
 USUAL = 2.0  # pixels of the crop: the correspondences' expected error, where the network gives none
 FIRST, SEMIFINALISTS, HEATS, FINALISTS = 1, 4, 3, 2  # iterations after which only so many hypotheses go on
 DOUBT = 0.3  # evidence that outweighs a radian of predicted angle
@@ -252,9 +252,10 @@ class PoseEstimator:
         found = prediction.correspondences
         error = float(np.median(found.scale_px)) if found is not None and len(found.scale_px) else USUAL
         update = self.refine_options.update
-        updated = update_pose(T_cam_obj, self.model, prediction, observed, rendered, update)
+        outlined = self.refine_options.outline
+        updated = update_pose(T_cam_obj, self.model, prediction, observed, rendered, update, outlined)
         angle = predicted_angle(T_cam_obj, prediction, updated, update)
-        return presence(agreement_of(observed, rendered), error), angle
+        return presence(agreement_of(observed, rendered).structure, error, angle), angle
 
     def _scores(self, judge: Judge, refined: Sequence[Refinement]) -> list[float]:
         evidence = judge.scores([r.T_cam_obj for r in refined])
@@ -305,9 +306,11 @@ def score(angle: float, evidence: float) -> float:
     return evidence - DOUBT * angle
 
 
-def presence(agreement: Agreement, error_px: float) -> float:
-    """Between 0 and 1: how likely it is that the object is there in this pose. error_px: median of the errors that the
-    network expects of its correspondences, pixels of the crop. A logistic function fitted to estimates of objects,
-    shown and not shown, in composed scenes: docs/decisions/0014."""
-    total = SILHOUETTE * agreement.silhouette + STRUCTURE * agreement.structure - BLUR * np.log(error_px) + BIAS
+def presence(structure: float, error_px: float, angle: float) -> float:
+    """Between 0 and 1: how likely it is that the object is there in this pose. structure: `Agreement`'s, how alike the
+    brightness gradients of picture and drawing are. error_px: median of the errors that the network expects of its
+    correspondences, pixels of the crop. angle: predicted rotation error, radians. A logistic function fitted to
+    estimates of objects, shown and not shown, in composed scenes: docs/decisions/0020."""
+    degrees = max(float(np.rad2deg(angle)), SMALLEST)
+    total = STRUCTURE * structure + BLUR * np.log(error_px) + ANGLE * np.log(degrees) + BIAS
     return float(1 / (1 + np.exp(-total)))
