@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import runpy
 import sys
 from pathlib import Path
@@ -91,3 +92,28 @@ def test_notebook(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         assert cell["outputs"] == [], "the notebook is kept without its outputs"
         exec(compile("".join(cell["source"]), f"quickstart.ipynb, code cell {number}", "exec"), names)
     assert (tmp_path / "posekit-out/quickstart/result.json").is_file()
+
+
+def test_troubleshooting_quotes_messages_that_exist() -> None:
+    source = "\n".join(file.read_text() for file in sorted((ROOT / "src/posekit").rglob("*.py")))
+    joined = re.sub(r"""["']\s*\n\s*f?["']""", "", source)  # texts that go on in the next line
+    quoted = re.findall(r"^\*\*`(.+)`\*\*$", (ROOT / "docs/troubleshooting.md").read_text(), re.MULTILINE)
+    assert len(quoted) > 10
+    for message in quoted:
+        for part in message.split("..."):
+            assert part.strip(" :") in joined, f"no message has {part!r} (of {message!r})"
+
+
+@pytest.mark.parametrize(
+    "page", ["README.md", *(f"docs/{n}.md" for n in ("quickstart", "your-object", "troubleshooting"))]
+)
+def test_links_and_pictures_exist(page: str) -> None:
+    links = re.findall(r"\]\(([^)#]+)\)", (ROOT / page).read_text())
+    assert links
+    for link in links:
+        assert (ROOT / page).parent.joinpath(link).exists(), f"{page} links to {link}, which does not exist"
+
+
+def test_pictures_are_small() -> None:
+    pictures = list((ROOT / "docs/pictures").iterdir())
+    assert pictures and all(file.stat().st_size <= 200_000 for file in pictures)
