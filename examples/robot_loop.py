@@ -40,9 +40,12 @@ def main() -> None:
     for number, image in enumerate(frames()):
         tracker = tracker or first_pose(image, estimator)
         found = None if tracker is None else tracker.step(image)
-        if found is None or found.T_cam_obj is None or not found.reliable:
-            print(f"frame {number}: {'nothing reliable' if found is None else found.state}: the robot waits")
-            if found is not None and found.T_cam_obj is None:
+        if found is None:
+            print(f"frame {number}: not found: the robot waits")
+            continue
+        if found.T_cam_obj is None or not found.reliable:
+            print(f"frame {number}: {found.state}, not reliable: the robot waits")
+            if found.T_cam_obj is None:
                 tracker = None  # lost: begin anew
             continue
         T_base_obj = T_BASE_CAM @ found.T_cam_obj.matrix  # 4x4, metres
