@@ -31,6 +31,9 @@ BLACK, CREAM, ORANGE, GREY = (34, 34, 38), (238, 226, 196), (232, 116, 30), (128
 _SHADE = Light(ambient=0.5, direction=(-0.45, -0.75, -0.5), diffuse=0.6, specular=0.15)
 _TO_LIGHT_TABLE = np.array([-0.35, -0.25, 0.9])  # roughly where _SHADE comes from, for the shadow
 
+_CAMERA = Camera(610.0, 610.0, 322.0, 236.0, 640, 480)
+_T_CAM_TABLE = Pose(view_rotation([0.25, -0.8, 0.5]), np.array([0.035, 0.025, 0.62]))
+
 
 @dataclass(frozen=True, eq=False)
 class Example:
@@ -45,17 +48,30 @@ class Example:
 def make_example(renderer: Renderer, seed: int = 0) -> Example:
     """The locomotive on the table, 640x480; the seed moves it a little and draws the noise."""
     rng = np.random.default_rng(seed)
-    camera = Camera(610.0, 610.0, 322.0, 236.0, 640, 480)
-    R_cam_table = view_rotation([0.25, -0.8, 0.5])
-    T_cam_table = Pose(R_cam_table, np.array([0.035, 0.025, 0.62]))
     T_table_obj = Pose(euler_xyz([0, 0, np.deg2rad(rng.uniform(20, 50))]), np.zeros(3))
-    T_cam_obj = T_cam_table @ T_table_obj
-    model = locomotive()
-    [seen] = renderer.render(model, [T_cam_obj], camera, rgb=False, coords=False)
+    room = _room(_fine(_CAMERA), _T_CAM_TABLE, rng)
+    return _example(renderer, locomotive(), T_table_obj, room, rng)
+
+
+def make_film(renderer: Renderer, frames: int, seed: int = 0) -> Iterator[Example]:
+    """The locomotive turns in an arc on the same table, 640x480, two degrees from frame to frame: one Example each."""
+    rng = np.random.default_rng(seed)
+    room, model = _room(_fine(_CAMERA), _T_CAM_TABLE, rng), locomotive()
+    for k in range(frames):
+        turn = np.deg2rad(10 + 2.0 * k)
+        way = Pose(euler_xyz([0, 0, turn]), 0.12 * np.array([np.sin(turn), -np.cos(turn), 0]) + (-0.06, 0.1, 0))
+        yield _example(renderer, model, way, room, rng)
+
+
+def _example(
+    renderer: Renderer, model: ObjectModel, T_table_obj: Pose, room: NDArray[np.float32], rng: np.random.Generator
+) -> Example:
+    T_cam_obj = _T_CAM_TABLE @ T_table_obj
+    [seen] = renderer.render(model, [T_cam_obj], _CAMERA, rgb=False, coords=False)
     box = mask_box(seen.mask) if seen.mask is not None else None
     assert box is not None, "the example's object lies in front of its camera"
-    image = _photograph(renderer, model, T_cam_obj, T_cam_table, camera, rng)
-    return Example(model, View(image, camera), T_cam_obj, box)
+    image = _photograph(renderer, model, T_cam_obj, room, rng)
+    return Example(model, View(image, _CAMERA), T_cam_obj, box)
 
 
 def ply(model: ObjectModel) -> str:
@@ -178,18 +194,21 @@ def _model(name: str, parts: Sequence[_Part]) -> ObjectModel:
 # --- the picture ------------------------------------------------------------------------------------------------
 
 
+def _fine(camera: Camera) -> Camera:
+    """Twice the pixels: pictures are drawn so and averaged, as a sensor's pixels average."""
+    return camera.resized(2 * camera.width, 2 * camera.height)
+
+
 def _photograph(
-    renderer: Renderer, model: ObjectModel, T_cam_obj: Pose, T_cam_table: Pose, camera: Camera, rng: np.random.Generator
+    renderer: Renderer, model: ObjectModel, T_cam_obj: Pose, room: NDArray[np.float32], rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Drawn at twice the size and averaged, as a sensor's pixels average."""
-    large = camera.resized(2 * camera.width, 2 * camera.height)
-    clutter = _clutter()
-    light = _room(large, T_cam_table, rng)
-    light *= _shadow(clutter, T_cam_table, T_cam_table, large) * _shadow(model, T_cam_obj, T_cam_table, large)
-    scene = _paste(light, renderer.render(clutter, [T_cam_table], large, light=_SHADE, coords=False)[0])
+    """The room, as `_room` draws it for the fine camera, with clutter and the model in it."""
+    fine, clutter = _fine(_CAMERA), _clutter()
+    dark = _shadow(clutter, _T_CAM_TABLE, _T_CAM_TABLE, fine) * _shadow(model, T_cam_obj, _T_CAM_TABLE, fine)
+    scene = _paste(room * dark, renderer.render(clutter, [_T_CAM_TABLE], fine, light=_SHADE, coords=False)[0])
     scene = cv2.GaussianBlur(scene, (0, 0), 2.2)  # the lens is focused on the object
-    scene = _paste(scene, renderer.render(model, [T_cam_obj], large, light=_SHADE, coords=False)[0])
-    return _develop(cv2.resize(scene, camera.size, interpolation=cv2.INTER_AREA), rng)
+    scene = _paste(scene, renderer.render(model, [T_cam_obj], fine, light=_SHADE, coords=False)[0])
+    return _develop(cv2.resize(scene, _CAMERA.size, interpolation=cv2.INTER_AREA), rng)
 
 
 def _room(camera: Camera, T_cam_table: Pose, rng: np.random.Generator) -> NDArray[np.float32]:
