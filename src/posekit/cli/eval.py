@@ -20,6 +20,7 @@ from posekit.cli.options import (
     PresetOption,
     StopAngleOption,
     StopOption,
+    Units,
     UpdateOption,
     WeightsOption,
 )
@@ -46,6 +47,9 @@ def evaluate(
         typer.Option(metavar="DIR", help="The data set, or the folder that holds it.", rich_help_panel=DATA),
     ] = None,
     split: Annotated[str | None, typer.Option(help="Folder with the scenes.", rich_help_panel=DATA)] = None,
+    units: Annotated[
+        Units, typer.Option(help="Of the meshes; auto: BOP's mm, or what models_info.json tells.", rich_help_panel=DATA)
+    ] = "auto",
     objects: Annotated[
         str | None, typer.Option(metavar="1,9|ape,duck", help="Only these objects.", rich_help_panel=DATA)
     ] = None,
@@ -129,6 +133,7 @@ def evaluate(
         dataset=dataset,
         root=root,
         split=split,
+        units=units,
         objects=_objects(objects, dataset, root, split),
         images=chosen,
         limit=limit,
