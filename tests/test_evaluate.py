@@ -277,7 +277,7 @@ def test_many_bad_entries_are_counted_and_nothing_else_is_refused(
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ('{"a": 1}', "line 1: a detections file is a JSON list"),
+        ('{"a": 1}', "line 1: a detections file for a data set is a JSON list"),
         ("[\n{]", "line 2"),
         ("[\n1]", "none that can be used; line 2: an entry is"),
         ('[\n{"scene_id": 1}]', "line 2: image_id, category_id, score, bbox missing"),
