@@ -263,6 +263,19 @@ def test_a_stated_diameter_of_something_else_is_told(root: Path, caplog: pytest.
     assert "models_info.json says 4000" in caplog.text
 
 
+@pytest.mark.parametrize(("units", "scale"), [("mm", 1.0), ("m", 1000.0), ("cm", 10.0)])
+def test_units_that_are_given_are_taken(units: str, scale: float, root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Also where models_info.json tells another story."""
+    stated = BopDataset(root).model(1).diameter
+    for path in (root / "models").glob("obj_*.ply"):
+        mesh = trimesh.load(path, process=False)
+        mesh.apply_scale(1 / scale)
+        mesh.export(path)
+    caplog.clear()
+    assert BopDataset(root, units=units).model(1).diameter == pytest.approx(stated, rel=1e-5)
+    assert not caplog.records
+
+
 def test_poses_in_metres_are_refused(root: Path) -> None:
     path = root / "test" / "000002" / "scene_gt.json"
     data = json.loads(path.read_text())

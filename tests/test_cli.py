@@ -513,6 +513,30 @@ def test_the_output_is_checked_before_anything_is_read(option: str, invoke: Invo
     assert_fails(result, "cannot be written", "Permission denied")
 
 
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("eval", "--root", "nowhere", "--out"),
+        ("train", "pose", "--model", "nowhere.ply", "--out"),
+        ("train", "detector", "--model", "nowhere.ply", "--out"),
+        ("synth", "--models", "nowhere", "--out"),
+        ("download", "lmo", "--root"),
+    ],
+    ids=lambda command: " ".join(command[:2]),
+)
+def test_every_command_checks_its_output_first(
+    command: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before meshes and data sets, which are not there, and before anything is fetched."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:9")
+    (tmp_path / "taken").touch()
+    result = CliRunner().invoke(app, [*command, "taken/out"])
+    said = " ".join(result.output.split())
+    assert result.exit_code == 1 and "cannot be written" in said and "taken is a file" in said, said
+    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
+
+
 def test_an_output_folder_below_a_file(invoke: Invoke, tmp_path: Path) -> None:
     (tmp_path / "taken").touch()
     assert_fails(invoke("estimate", "nowhere.png", out="taken/out"), "cannot be written", "taken is a file")

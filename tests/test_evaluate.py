@@ -1,4 +1,10 @@
-"""posekit eval: scores of known estimates, malformed files, workers, interruption, results and report."""
+"""posekit eval: scores of known estimates, malformed files, workers, interruption, results and report.
+
+Detections in files. Accepted: BOP's list, numbers as text, a byte order mark. Warned about and skipped, with the line:
+an entry that cannot be used, repeats another, is of no picture or object of the data set, or does not fit its picture.
+Warned about and read: boxes that only fit as x0, y0, x1, y1. Refused: other files, and those without an entry that can
+be used. Results in CSV. Accepted: BOP's. Refused, with the line: all else.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +30,7 @@ from posekit.errors import InputError, OutputError
 from posekit.estimate import EstimateOptions
 from posekit.evaluate import EvalOptions, compare, evaluate
 from posekit.evaluate.bop_results import COLUMNS, ResultRow, csv_name, read_detections, read_results, results_csv
-from posekit.evaluate.stages import ImageStage
+from posekit.evaluate.stages import ImageStage, detections_for
 from posekit.evaluate.table import novelty
 from posekit.evaluate.truths import TruthReader
 from posekit.geometry import Pose, so3_exp
@@ -235,26 +241,48 @@ ENTRY = {"scene_id": 2, "image_id": 0, "category_id": 1, "score": 0.9, "bbox": [
         ({"score": 10**400}, "finite numbers"),
         ({"segmentation": {"size": [2, 2], "counts": [1, 1]}}, "counts that fill it"),
         ({"time": 0.3, "score": 0.1}, "time 0.3 differs from 0.1 in line 2"),
-        ({}, "the entry repeats line 2"),
+        ({}, "it repeats line 2"),
     ],
 )
-def test_malformed_detections_are_refused_with_their_line(
-    root: Path, tmp_path: Path, change: dict[str, object], reason: str
+def test_a_bad_entry_of_detections_is_skipped_and_told(
+    root: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, change: dict[str, object], reason: str
 ) -> None:
     path = tmp_path / "detections.json"
     path.write_text("[\n" + json.dumps(ENTRY) + ",\n" + json.dumps(ENTRY | change) + "\n]")
-    with pytest.raises(InputError, match=reason) as refusal:
+    found = read_detections(path, *known(root))
+    assert [(r.line, r.obj_id, r.score) for regions in found.values() for r in regions] == [(2, 1, 0.9)]
+    assert caplog.text.count("skipped") == 1
+    assert reason in caplog.text and f"{path}, line 3: the entry is skipped" in caplog.text
+
+
+def test_numbers_that_are_text_are_read(root: Path, tmp_path: Path) -> None:
+    path = tmp_path / "detections.json"
+    path.write_text("\ufeff" + json.dumps([ENTRY | {"scene_id": "2", "image_id": "0", "category_id": "1"}]))
+    assert [(r.scene, r.image, r.obj_id) for r in read_detections(path, *known(root))[2, 0]] == [(2, 0, 1)]
+
+
+def test_many_bad_entries_are_counted_and_nothing_else_is_refused(
+    root: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "detections.json"
+    bad = [ENTRY | {"image_id": 900 + k} for k in range(50)]
+    path.write_text(json.dumps([ENTRY, *bad]))
+    assert sum(map(len, read_detections(path, *known(root)).values())) == 1
+    assert len(caplog.records) == 11 and "50 entries in all are skipped, 1 are used" in caplog.text
+    path.write_text(json.dumps(bad))
+    with pytest.raises(InputError, match="has 50 entries and none that can be used; line 1: scene 2 has no image 900"):
         read_detections(path, *known(root))
-    assert "line 3:" in str(refusal.value)
 
 
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ('{"a": 1}', "line 1: a detections file is a JSON list"),
+        ('{"a": 1}', "line 1: a detections file for a data set is a JSON list"),
         ("[\n{]", "line 2"),
-        ("[\n1]", "line 2: an entry is"),
+        ("[\n1]", "none that can be used; line 2: an entry is"),
         ('[\n{"scene_id": 1}]', "line 2: image_id, category_id, score, bbox missing"),
+        ("[\n" + "[" * 100_000, "line 2"),
+        ("[\n" + "9" * 5000 + "]", "line 2"),
     ],
 )
 def test_what_is_no_list_of_detections(root: Path, tmp_path: Path, text: str, reason: str) -> None:
@@ -306,6 +334,35 @@ def test_estimates_from_a_detections_file(root: Path, tmp_path: Path) -> None:
     assert results["detection_ap"] == dict.fromkeys(names, 50.0)
     [found] = [e for e in results["instances"] if e["found"]]
     assert found["detection_score"] == 0.9
+
+
+def test_detections_that_do_not_fit_the_picture_are_skipped(
+    root: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    box = [float(v) for v in (5, 5, 40, 40)]
+    wrong = [
+        {"score": 0.1, "bbox": [900.0, 5.0, 4.0, 4.0]},
+        {"score": 0.2, "segmentation": {"size": [2, 3], "counts": [6]}},
+        {"score": 0.3, "segmentation": {"size": [CAMERA.height, CAMERA.width], "counts": "~~~"}},
+    ]
+    path = tmp_path / "detections.json"
+    path.write_text("[" + ",\n".join(json.dumps(ENTRY | {"bbox": box} | change) for change in ({}, *wrong)) + "]")
+    options = EvalOptions("estimate", root=root, images=((2, 0),), detections=str(path), estimate=QUICK)
+    record = ImageStage(options).run(2, 0)
+    assert record["detections"]["1"]["scores"] == [0.9]
+    for line, reason in ((2, "outside"), (3, "a mask is 3x2"), (4, "run lengths")):
+        assert f"line {line} (scene 2, image 0): the entry is skipped" in caplog.text and reason in caplog.text
+
+
+def test_boxes_with_corners_are_noticed(root: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """x0, y0, x1, y1 near the right lower corner cannot be x, y, width, height."""
+    width, height = CAMERA.size
+    corners = [width - 40.0, height - 30.0, width - 2.0, height - 1.0]
+    path = tmp_path / "detections.json"
+    path.write_text(json.dumps([ENTRY | {"bbox": corners}]))
+    options = EvalOptions("estimate", root=root, images=((2, 0),), detections=str(path), estimate=QUICK)
+    [region] = detections_for(BopDataset(root), options)[2, 0]
+    assert region.box == tuple(corners) and "x0, y0, x1, y1: they are taken for the latter" in caplog.text
 
 
 def test_objects_by_name(root: Path, tmp_path: Path) -> None:
@@ -455,7 +512,7 @@ def test_another_run_is_not_overwritten(alone: Path, root: Path, tmp_path: Path)
 @pytest.mark.parametrize(
     ("args", "reason"),
     [
-        ([], "which data set? Pass --dataset NAME"),
+        ([], "which data set? Give its name (--dataset NAME"),
         (["--dataset", "lmoo"], "Did you mean lmo?"),
         (["--stage", "score", "--root", "ROOT"], "what is to be scored? Pass --csv FILE"),
         (["--root", "ROOT", "--objects", "7"], "the data set has no objects [7]; there are [1, 2]"),

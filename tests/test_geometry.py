@@ -241,7 +241,7 @@ def test_field_of_view() -> None:
 
 @pytest.mark.parametrize("values", [(0, 1, 0, 0), (1, 0, 0, 0), (-5, 5, 0, 0), (np.nan, 5, 0, 0), (5, 5, np.inf, 0)])
 def test_bad_intrinsics_are_refused(values: tuple[float, ...]) -> None:
-    with pytest.raises(CameraError, match=r"must be positive numbers of pixels. Pass --camera"):
+    with pytest.raises(CameraError, match=r"must be positive numbers of pixels. Give fx,fy,cx,cy"):
         Camera(*values, 640, 480)
     with pytest.raises(CameraError, match="at least 1 pixel"):
         Camera(5, 5, 0, 0, 0, 480)

@@ -1,4 +1,10 @@
-"""Networks: shapes, statistics, losses and their gradients, weights on disk, one batch over-fitted."""
+"""Networks: shapes, statistics, losses and their gradients, weights on disk, one batch over-fitted.
+
+Weights. Accepted: NAME.safetensors with NAME.toml beside it, named by the file, its stem or its folder; in 16 or 32
+bits; without MV-Net. Refused: a file that is missing or damaged, one without its TOML, another preset, a TOML of other
+weights (by the hash), unknown keys, tensors that are missing, too many or of another shape, numbers that are not
+finite. There are no warnings: weights are read strictly.
+"""
 
 from __future__ import annotations
 

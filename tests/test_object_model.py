@@ -395,9 +395,13 @@ def test_auto_decides_by_the_diameter_and_says_so(
 @pytest.mark.parametrize(
     ("given", "units", "text"),
     [
-        (7.0, "auto", "could be metres or millimetres: pass --units m or --units mm"),
-        (102.0, "m", r"duck.ply has a diameter of 102 m; posekit works in metres: pass --units mm"),
-        (0.5, "mm", r"has a diameter of 0.5 mm; posekit works in metres: pass --units m or --units cm"),
+        (7.0, "auto", "could be metres or millimetres: give --units m or --units mm"),
+        (
+            102.0,
+            "m",
+            r"duck.ply has a diameter of 102 m; posekit works in metres: give --units mm \(units='mm' in Python\)",
+        ),
+        (0.5, "mm", r"has a diameter of 0.5 mm; posekit works in metres: give --units m or --units cm"),
         (50_000.0, "auto", "from 1 mm to 10 m: scale the mesh"),
         (0.0004, "auto", "from 1 mm to 10 m: scale the mesh"),
         (1.0, "inch", "units are auto, mm, cm, m, in, not 'inch'"),
@@ -486,6 +490,8 @@ def test_symmetries_beside_the_mesh(tmp_path: Path) -> None:
         "[]",
         '{"box": {"symmetries_discrete": [[1, 2]]}}',
         '{"box": {"symmetries_discrete": [[0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1]]}}',
+        '{"box": {"symmetries_discrete": [[1%s, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]]}}' % ("0" * 400),
+        "[" * 100_000,
         '{"box": {"symmetries_continuous": [{"offset": [0, 0, 0]}]}}',
         '{"box": {"symmetries_continuous": [{"axis": [0, 0, 0]}]}}',
     ],
@@ -778,7 +784,7 @@ def test_the_note_on_units_says_the_size(tmp_path: Path, caplog: pytest.LogCaptu
     caplog.set_level(logging.INFO, logger="posekit")
     size = np.asarray(BOX.vertices) * 27 / np.linalg.norm((0.10, 0.06, 0.04))
     ObjectModel.load(write_ply(tmp_path / "b.ply", size, FACES))
-    assert "the object is 27 mm long" in caplog.text and "--units cm makes it 27 cm" in caplog.text
+    assert "the object is 27 mm long" in caplog.text and "; in cm it is 27 cm long" in caplog.text
 
 
 def textured_glb(path: Path, moved: dict[str, object] | None, picture: bytes | None = None) -> None:

@@ -1,4 +1,9 @@
-"""The trainer: a step teaches, a killed training ends as one that was not, two processes do as one, nothing is lost."""
+"""The trainer: a step teaches, a killed training ends as one that was not, two processes do as one, nothing is lost.
+
+Configurations. Accepted: TOML of TrainConfig's shape, whatever it leaves out as the recipe has it; whole numbers for
+fractions. Refused: what is missing or no TOML, an unknown key (the nearest one is named) or recipe, a value of another
+kind, a list of another length, numbers out of range. There are no warnings.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,12 @@
-"""Frames in and out: what can be read is, and the rest is told."""
+"""Frames in and out: what can be read is, and the rest is told.
+
+Accepted: videos that FFmpeg decodes, turned upright as players do, with titles in any letters; folders and globs of
+pictures, in the order of the numbers in their names; a BOP scene or a sensor's scene_camera_SENSOR.json; a camera's
+number; a camera for each picture, EXIF data, lens distortion. Told frame by frame: what cannot be decoded, a damaged
+picture, a size of another shape; a truncated video ends early. Warned of: a camera that is not known. Refused: what is
+not there or is no video, a video without pictures in it, a folder without pictures, several sensors, frames to be
+turned by no quarter.
+"""
 
 from __future__ import annotations
 
@@ -86,6 +94,21 @@ def test_a_truncated_video_gives_what_it_has(tmp_path: Path) -> None:
     cut.write_bytes(data[: len(data) // 2])
     read = [f for f in VideoFrames(cut, None) if f.image is not None]
     assert 1 <= len(read) < 40
+
+
+def test_a_title_that_is_no_text_stops_no_video(tmp_path: Path) -> None:
+    path = tmp_path / "a.mkv"
+    with av.open(str(path), "w") as container:
+        container.metadata["title"] = "TITLE"
+        stream = container.add_stream("mpeg4", rate=10)
+        stream.width, stream.height, stream.pix_fmt = *SIZE, "yuv420p"
+        for k in range(3):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture(k), format="rgb24")))
+        container.mux(stream.encode())
+    data = path.read_bytes()
+    assert b"TITLE" in data
+    path.write_bytes(data.replace(b"TITLE", b"T\x96TLE"))
+    assert len([frame for frame in open_frames(str(path), "100,100,48,32") if frame.problem is None]) == 3
 
 
 def test_damaged_frames_do_not_end_a_video(tmp_path: Path) -> None:

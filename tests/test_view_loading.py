@@ -412,7 +412,7 @@ def test_bad_camera_files(tmp_path: Path, name: str, text: str, why: str) -> Non
 
 @pytest.mark.parametrize("text", ["1,2,3", "0,0,0,0", "500,500,nan,240", "1,2,3,4,5", "-500,500,320,240"])
 def test_bad_numbers(text: str) -> None:
-    with pytest.raises(CameraError, match=r"give fx,fy,cx,cy|Pass --camera fx,fy,cx,cy"):
+    with pytest.raises(CameraError, match=r"give fx,fy,cx,cy|Give fx,fy,cx,cy"):
         load_camera(text, VGA)
 
 

@@ -83,7 +83,7 @@ def load_calibration(source: str | Path, size: Size, image: str | Path | None = 
     """
     text = str(source)
     if "," in text and re.fullmatch(r"[-+.,\deEinfa\s]+", text):
-        return _on_picture(_four_numbers(text, size), (), "pinhole", size, "--camera")
+        return _on_picture(_four_numbers(text, size), (), "pinhole", size, "the camera fx,fy,cx,cy")
     path = Path(source)
     content = _text(path)
     try:
@@ -204,7 +204,8 @@ def _entry_of_image(cameras: Mapping[Any, Any], image: str | Path | None) -> Any
     some = ", ".join(map(str, list(cameras)[:8])) + (", ..." if len(cameras) > 8 else "")
     wanted = f"image {number}" if digits else "a picture without a number in its name"
     raise CameraError(
-        f"it has no camera for {wanted}; it has {some}. Name the picture by its number, or pass --camera fx,fy,cx,cy."
+        f"it has no camera for {wanted}; it has {some}. Name the picture by its number, or give its camera as "
+        "fx,fy,cx,cy."
     )
 
 

@@ -34,7 +34,7 @@ class Camera:
         if not all(np.isfinite(values)) or self.fx <= 0 or self.fy <= 0:
             raise CameraError(
                 f"camera intrinsics fx={self.fx}, fy={self.fy}, cx={self.cx}, cy={self.cy}: "
-                "focal lengths must be positive numbers of pixels. Pass --camera fx,fy,cx,cy."
+                "focal lengths must be positive numbers of pixels. Give fx,fy,cx,cy in pixels."
             )
         if self.width < 1 or self.height < 1:
             raise CameraError(f"camera size {self.width}x{self.height}: both must be at least 1 pixel.")

@@ -64,7 +64,7 @@ def calibration_of(image: str | Path, size: Size, camera: str | Path | None = No
         return Calibration(found)
     log.warning(
         "%s: its camera is not known, so a field of view of 60 degrees is assumed: distances may be wrong by tens of "
-        "percent. Pass --camera fx,fy,cx,cy or a calibration file.",
+        "percent. Give fx,fy,cx,cy or a calibration file (--camera, camera= in Python).",
         Path(image).name,
     )
     return Calibration(Camera.from_fov(ASSUMED_FOV, *size))

@@ -84,7 +84,7 @@ class Symmetries:
 
     @classmethod
     def parse(cls, text: str, center: ArrayLike) -> Symmetries:
-        """Symmetries from a text as ``--symmetry`` takes it; center: (3,) metres, a point of every axis.
+        """Symmetries from a text such as ``z:2`` or ``x:2,y:inf``; center: (3,) metres, a point of every axis.
 
         ``AXIS:ORDER``, several separated by commas. AXIS is x, y or z (the mesh's own axes); ORDER is a whole
         number n from 2 on (looks the same after 1/n of a turn) or ``inf`` (after any turn). Products of the given
@@ -113,7 +113,8 @@ class Symmetries:
 
     @classmethod
     def from_bop(cls, info: Mapping[str, Any]) -> Symmetries:
-        """From an object's entry in BOP's ``models_info.json`` (mm). Raises ValueError where it is malformed."""
+        """From an object's entry in BOP's ``models_info.json`` (mm). Raises ValueError, TypeError,
+        KeyError or OverflowError where it is malformed."""
         discrete = []
         for numbers in info.get("symmetries_discrete", ()):
             matrix = np.asarray(numbers, dtype=np.float64).reshape(4, 4).copy()
@@ -893,7 +894,7 @@ def _chosen_units(label: str, diameter: float, units: str) -> str:
             could_be = "; ".join(f"{unit}: {_plain_length(diameter * UNITS[unit])} long" for unit in UNITS)
             raise MeshError(
                 f"{label} has a diameter of {diameter:.3g} in its own units, which could be metres or millimetres: "
-                f"pass --units m or --units mm, or another ({could_be})."
+                f"{_give_units('m', 'mm')}, or another ({could_be})."
             )
         chosen = "m" if diameter < _METRES_BELOW else "mm"
     else:
@@ -901,7 +902,7 @@ def _chosen_units(label: str, diameter: float, units: str) -> str:
     if not _plausible(diameter, chosen):
         fitting = [unit for unit in ("m", "mm", "cm", "in") if unit != chosen and _plausible(diameter, unit)]
         if fitting:
-            advice = f"posekit works in metres: pass --units {' or --units '.join(fitting)}."
+            advice = f"posekit works in metres: {_give_units(*fitting)}."
         else:
             advice = "posekit works with objects from 1 mm to 10 m: scale the mesh."
         raise MeshError(f"{label} has a diameter of {diameter:.3g} {chosen}; {advice}")
@@ -909,12 +910,17 @@ def _chosen_units(label: str, diameter: float, units: str) -> str:
         name = {"mm": "millimetres", "m": "metres"}[chosen]
         others = [unit for unit in UNITS if unit != chosen and _plausible(diameter, unit)]
         log.info(
-            "%s: a diameter of %.4g, so its units are taken for %s: the object is %s long (--units %s says so without "
-            "asking%s).",
-            label, diameter, name, _plain_length(diameter * UNITS[chosen]), chosen,
-            "".join(f"; --units {unit} makes it {_plain_length(diameter * UNITS[unit])}" for unit in others),
+            "%s: a diameter of %.4g, so its units are taken for %s: the object is %s long (%s to say so%s).",
+            label, diameter, name, _plain_length(diameter * UNITS[chosen]), _give_units(chosen),
+            "".join(f"; in {unit} it is {_plain_length(diameter * UNITS[unit])} long" for unit in others),
         )  # fmt: skip
     return chosen
+
+
+def _give_units(*units: str) -> str:
+    """What to do to have one of these units, for both kinds of users."""
+    options, values = (" or ".join(form.format(u) for u in units) for form in ("--units {}", "units={!r}"))
+    return f"give {options} ({values} in Python)"
 
 
 def _plain_length(metres: float) -> str:
@@ -951,7 +957,7 @@ def _symmetries_from_file(file: Path, mesh: Path) -> Symmetries:
         keys = [mesh.stem, *([str(int(number[1]))] if number else [])]
         own = data if any(key.startswith("symmetries_") for key in data) else {}
         return Symmetries.from_bop(next((data[key] for key in keys if key in data), own))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise MeshError(
             f"the symmetries in {file} cannot be used ({error}): give symmetries_discrete as lists of 16 numbers and "
             "symmetries_continuous as {axis, offset}, in mm, as BOP's models_info.json does."

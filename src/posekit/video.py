@@ -146,7 +146,7 @@ class _Intrinsics:
             self.known[(size,)] = Calibration(Camera.from_fov(ASSUMED_FOV, *size))
             log.warning(
                 "the camera is not known, so a field of view of 60 degrees is assumed: distances may be wrong by "
-                "tens of percent. Pass --camera fx,fy,cx,cy or a calibration file."
+                "tens of percent. Give fx,fy,cx,cy or a calibration file (--camera, camera= in Python)."
             )
         return self.known[(size,)]
 
@@ -271,7 +271,7 @@ def _opened(path: Path) -> Any:
     except ImportError as error:
         raise ImageError("reading videos needs PyAV: pip install av.") from error
     try:
-        container = av.open(str(path))
+        container = av.open(str(path), metadata_errors="replace")  # a title that is no UTF-8 stops no video
     except (av.FFmpegError, OSError) as error:
         raise ImageError(f"{path} is no video that can be read ({error}): give a video such as an MP4.") from error
     if not container.streams.video:

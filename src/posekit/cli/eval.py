@@ -21,6 +21,7 @@ from posekit.cli.options import (
     PresetOption,
     StopAngleOption,
     StopOption,
+    Units,
     UpdateOption,
     WeightsOption,
 )
@@ -47,6 +48,9 @@ def evaluate(
         typer.Option(metavar="DIR", help="The data set, or the folder that holds it.", rich_help_panel=DATA),
     ] = None,
     split: Annotated[str | None, typer.Option(help="Folder with the scenes.", rich_help_panel=DATA)] = None,
+    units: Annotated[
+        Units, typer.Option(help="Of the meshes; auto: BOP's mm, or what models_info.json tells.", rich_help_panel=DATA)
+    ] = "auto",
     objects: Annotated[
         str | None, typer.Option(metavar="1,9|ape,duck", help="Only these objects.", rich_help_panel=DATA)
     ] = None,
@@ -131,6 +135,7 @@ def evaluate(
         dataset=dataset,
         root=root,
         split=split,
+        units=units,
         objects=_objects(objects, dataset, root, split),
         images=chosen,
         limit=limit,

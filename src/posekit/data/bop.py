@@ -86,12 +86,17 @@ class BopDataset:
     split: the folder with scenes; ``test:photoneo`` where a scene has the pictures of several sensors
     (``scene_camera_photoneo.json``, ``rgb_photoneo/``); the only sensor needs no name. targets: a test's list of
     images and objects, by default the first ``SPLIT_targets_*.json`` (bop19 before others) in the folder; where there
-    is one, `images` and `instances` keep to it. Pass ``targets=None`` to see everything. Raises InputError where the
-    layout is not there.
+    is one, `images` and `instances` keep to it. Pass ``targets=None`` to see everything. units: of the meshes; auto is
+    BOP's mm, or what the stated diameter tells. Raises InputError where the layout is not there.
     """
 
     def __init__(
-        self, root: str | Path, split: str = "test", targets: str | None = "auto", models: str = "models"
+        self,
+        root: str | Path,
+        split: str = "test",
+        targets: str | None = "auto",
+        models: str = "models",
+        units: str = "auto",
     ) -> None:
         split, _, sensor = split.partition(":")
         self.root, self.split, self.name = Path(root), split, Path(root).resolve().name
@@ -101,7 +106,7 @@ class BopDataset:
                 f"{self.root} has no folder {split!r}: a data set in BOP layout has models/ and {split}/000001/ and so "
                 "on. Check the path and the split."
             )
-        self._models = self.root / models
+        self._models, self._units = self.root / models, units
         self._targets_file = self._find_targets(targets)
         self._loaded: dict[int, ObjectModel] = {}
         self._measured: dict[int, MeasuredModel] = {}
@@ -123,7 +128,7 @@ class BopDataset:
             if path is None:
                 wanted = self._models / f"obj_{obj_id:06d}.ply"
                 raise MeshError(f"there is no mesh {wanted} for object {obj_id}; there are {self.model_ids()}.")
-            self._loaded[obj_id] = _mesh(path, _stated(path.parent / "models_info.json", obj_id))
+            self._loaded[obj_id] = self._mesh(path, obj_id)
         return self._loaded[obj_id]
 
     def measured_model(self, obj_id: int) -> MeasuredModel:
@@ -131,9 +136,14 @@ class BopDataset:
         if obj_id not in self._measured:
             fine = _meshes(self.root / "models_eval").get(obj_id)
             info = (self._models if fine is None else fine.parent) / "models_info.json"
-            model = self.model(obj_id) if fine is None else _mesh(fine, _stated(info, obj_id))
+            model = self.model(obj_id) if fine is None else self._mesh(fine, obj_id)
             self._measured[obj_id] = MeasuredModel(model, _diameter(info, obj_id, model))
         return self._measured[obj_id]
+
+    def _mesh(self, path: Path, obj_id: int) -> ObjectModel:
+        if self._units != "auto":
+            return ObjectModel.load(path, units=self._units)
+        return _mesh(path, _stated(path.parent / "models_info.json", obj_id))
 
     def scenes(self) -> list[int]:
         """The scenes' numbers."""
@@ -429,7 +439,10 @@ def _mesh(path: Path, stated: float | None) -> ObjectModel:
     fitting = [u for u, m in found.items() if stated is not None and _alike(1000 * m.diameter, stated)]
     chosen = next(iter(fitting or [u for u in ("mm", "m") if u in found]), None)
     if chosen is None:
-        raise MeshError(f"{reason}. The meshes of a data set in BOP layout are in mm: scale it.")
+        raise MeshError(
+            f"{reason}. The meshes of a data set in BOP layout are in mm: scale it, or give their units (--units of "
+            "posekit eval, units= of BopDataset)."
+        )
     model = found[chosen]
     inside = 1000 * model.diameter
     if chosen != "mm":
@@ -439,7 +452,8 @@ def _mesh(path: Path, stated: float | None) -> ObjectModel:
         log.warning("%s: it is %.4g mm long, and models_info.json says %.4g: measures use the latter.", path.name,
                     inside, stated)  # fmt: skip
     elif stated is None and inside < _DOUBTFUL_MM:
-        log.warning("%s: it is %.3g mm long, as BOP's meshes are in mm; where it is in metres, scale it by 1000.",
+        log.warning("%s: it is %.3g mm long, as BOP's meshes are in mm; where it is in another unit, give it "
+                    "(--units of posekit eval, units= of BopDataset).",
                     path.name, inside)  # fmt: skip
     return model
 

@@ -111,7 +111,7 @@ def dataset_info(name: str) -> DatasetInfo:
         meant = f" Did you mean {near[0]}?" if near else ""
         raise ConfigError(
             f"there is no data set {name!r}; there are {', '.join(DATASETS)}.{meant} Any other one in BOP layout: "
-            "--root DIR without --dataset."
+            "give its folder (--root DIR, root= in Python) without a name."
         )
     return DATASETS[name]
 
@@ -137,7 +137,8 @@ def find_root(info: DatasetInfo, root: Path | None) -> Path:
             return candidate
     raise InputError(
         f"the data set {info.name} ({info.title}) is not in {base}: there is no folder {info.split}/ in it or in "
-        f"{info.below}/. Fetch it with: posekit download {info.name} --root {base}; or pass --root DIR."
+        f"{info.below}/. Fetch it with: posekit download {info.name} --root {base}; or give the folder that "
+        "has it (--root DIR, root= in Python)."
     )
 
 
@@ -152,24 +153,31 @@ def own_names(root: Path) -> dict[int, str]:
         raise InputError(f"{path} cannot be read ({error}): it holds the objects' names by number.") from error
 
 
-def open_dataset(name: str | None, root: Path | None, split: str | None = None) -> tuple[Dataset, DatasetInfo]:
-    """A data set by its name, its folder, or both. Raises ConfigError, InputError.
+def open_dataset(
+    name: str | None, root: Path | None, split: str | None = None, units: str = "auto"
+) -> tuple[Dataset, DatasetInfo]:
+    """A data set by its name, its folder, or both. units: of BOP's meshes. Raises ConfigError, InputError.
 
     Without a name the folder's own is taken where it is a known one.
     """
     if name is None and root is None:
-        raise ConfigError("which data set? Pass --dataset NAME, or --root DIR with one in BOP layout.")
+        raise ConfigError(
+            "which data set? Give its name (--dataset NAME, dataset= in Python), or the folder of one in BOP layout "
+            "(--root DIR, root=)."
+        )
     if name is None:
         assert root is not None
         known = DATASETS.get(root.resolve().name)
         if known is None or not (root / (split or known.split).partition(":")[0]).is_dir():
-            data = BopDataset(root, split or "test")
+            data = BopDataset(root, split or "test", units=units)
             return data, DatasetInfo(data.name, data.name, tuple(data.model_ids()), own_names(root))
         name = known.name
     info = dataset_info(name)
     folder = find_root(info, root)
     if name == "linemod":
+        if units != "auto":
+            raise ConfigError(f"the units of {info.title}'s meshes are known: leave the units {units} out.")
         chosen = DeepimDataset(folder) if is_deepim(folder) else LinemodDataset(folder, split or info.split)
         return chosen, info
     models = info.models if (folder / info.models).is_dir() else "models"
-    return BopDataset(folder, split or info.split, models=models), info
+    return BopDataset(folder, split or info.split, models=models, units=units), info

@@ -36,16 +36,20 @@ def download(info: DatasetInfo, folder: Path, *, endpoint: str | None = None, ke
     Raises InputError where the hub cannot be reached or a file is damaged, OutputError where it cannot be written.
     """
     if not info.archives:
-        raise InputError(f"where {info.title} is to be had is not known: get it by hand and pass --root.")
+        raise InputError(
+            f"where {info.title} is to be had is not known: get it by hand and give its folder to posekit eval."
+        )
     target = folder / info.below
     archives = folder / ".archives" / info.below
+    for place in (target, archives):
+        check_writable(place, f"the folder {place} cannot be written")
     try:
         target.mkdir(parents=True, exist_ok=True)
         archives.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f"the folder {target} cannot be made: {error.strerror}. Pass --root DIR.") from error
-    for place in (target, archives):
-        check_writable(place, f"the folder {place} cannot be written")
+        raise OutputError(
+            f"the folder {target} cannot be made: {error.strerror}. Choose another (--root DIR)."
+        ) from error
     fetched = []
     for name in info.archives:
         marker = target / f"{_DONE}-{name}"
@@ -75,7 +79,7 @@ def _fetch(repository: str, name: str, folder: Path, endpoint: str | None) -> tu
         first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise InputError(
             f"{name} of {repository} could not be fetched: {first} What was fetched is kept: run the command again; "
-            "or get it by hand and pass --root."
+            "or get it by hand and give its folder to posekit eval."
         ) from error
     digest = _sha256(path)
     if stated is not None and re.fullmatch(r"[0-9a-f]{64}", stated) and digest != stated:

@@ -92,19 +92,9 @@ class DetectionsFile:
         return ", ".join(f"{n} ({self.names[n]})" if n in self.names else str(n) for n in sorted(numbers))
 
     def _corners(self, view: View) -> bool:
-        """Whether all boxes of the picture are x0, y0, x1, y1, which is told: so they lie within it, and some do not as
-        x, y, width, height."""
-        width, height = (view.camera if view.lens is None else view.lens.camera).size
-        boxes = [e["bbox"] for e in self.entries if _four(e.get("bbox"))]
-        inside = all(x0 < x1 <= width + 1 and y0 < y1 <= height + 1 for x0, y0, x1, y1 in boxes)
-        beyond = any(x + w > _BEYOND * width or y + h > _BEYOND * height for x, y, w, h in boxes)
-        if inside and beyond:
-            log.warning(
-                "%s: its boxes go beyond the picture of %dx%d pixels as x, y, width, height, and lie within it as "
-                "x0, y0, x1, y1: they are taken for the latter. COCO and BOP have the former: correct the file.",
-                self.label, width, height,
-            )  # fmt: skip
-        return inside and beyond
+        """Whether all boxes of the picture are x0, y0, x1, y1, which is told."""
+        size = (view.camera if view.lens is None else view.lens.camera).size
+        return are_corners([e["bbox"] for e in self.entries if _four(e.get("bbox"))], size, self.label)
 
     def _told(
         self, k: int, entry: Mapping[str, Any], view: View, model: ObjectModel, corners: bool
@@ -204,6 +194,21 @@ def model_number(name: str) -> int | None:
     """The number at the end of a mesh's name, as BOP numbers objects; None without one."""
     found = re.search(r"(\d+)$", name)
     return int(found[1]) if found else None
+
+
+def are_corners(boxes: Sequence[Sequence[float]], size: tuple[int, int], label: str) -> bool:
+    """Whether boxes that should be x, y, width, height are x0, y0, x1, y1, which is told: so all lie within the picture
+    (size: its width, height), and some do not as the former. label: of the file."""
+    width, height = size
+    inside = all(x0 < x1 <= width + 1 and y0 < y1 <= height + 1 for x0, y0, x1, y1 in boxes)
+    beyond = any(x + w > _BEYOND * width or y + h > _BEYOND * height for x, y, w, h in boxes)
+    if inside and beyond:
+        log.warning(
+            "%s: its boxes go beyond the picture of %dx%d pixels as x, y, width, height, and lie within it as "
+            "x0, y0, x1, y1: they are taken for the latter. COCO and BOP have the former: correct the file.",
+            label, width, height,
+        )  # fmt: skip
+    return inside and beyond
 
 
 def _four(values: Any) -> bool:

@@ -179,7 +179,7 @@ def load_coco() -> TrainedDetector:
     except OSError as error:
         raise WeightsError(
             f"torchvision could not fetch its COCO weights ({error}): this needs the internet once. Without it use "
-            "--detector novel, or weights of posekit train detector."
+            "the detector 'novel' (--detector novel), or weights of posekit train detector."
         ) from error
     classes = tuple(weights.meta["categories"][1:])
     config = dataclasses.replace(paper_config(classes), use_size=(1333, 800))
@@ -304,7 +304,7 @@ class MaskRCNN:
         if unknown:
             raise ConfigError(
                 f"this detector does not know {', '.join(unknown)}; it was trained for {', '.join(classes)}. Use "
-                "--detector novel, or train one with posekit train detector."
+                "the detector 'novel' (--detector novel), or train one with posekit train detector."
             )
         found = find_in_looks(self.detector, view.image, LOOKS[self.detector.config.backbone], least=self.least)
         left = dict.fromkeys([m.name for m in models] or classes, self.most or len(found.labels))

@@ -1,10 +1,12 @@
-"""Files that others make: BOP's results CSV and detections JSON. Whatever is wrong in them is refused with its line."""
+"""Files that others make: BOP's results CSV, refused with the line where anything is wrong, as BOP's server does, and
+detections JSON, whose bad entries are skipped and told."""
 
 from __future__ import annotations
 
 import csv
 import io
 import json
+import logging
 import math
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -22,6 +24,9 @@ from posekit.errors import InputError
 COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 _LOOSE = 0.01  # how far R R^T may be from the identity: files are rounded
 _SAME_TIME = 1e-3  # seconds
+_TOLD = 10  # skipped entries of a file that are told one by one
+
+log = logging.getLogger("posekit")
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +69,7 @@ def read_results(
     lines = text.splitlines()
     if not lines:
         raise InputError(f"{path} is empty: a BOP results file starts with the line {','.join(COLUMNS)}.")
-    header = tuple(name.strip() for name in lines[0].lstrip("\ufeff").split(","))
+    header = tuple(name.strip() for name in lines[0].split(","))
     missing = [name for name in COLUMNS if name not in header]
     if missing:
         raise InputError(f"{path}, line 1: the columns {', '.join(missing)} are missing; needed: {','.join(COLUMNS)}.")
@@ -168,7 +173,7 @@ def _check_rotations(path: Path, rows: list[ResultRow], lines: list[int]) -> Non
 
 @dataclass(frozen=True, eq=False)
 class FoundRegion:
-    """A detection of a file. rle: COCO's counts and size, or None."""
+    """A detection of a file. rle: COCO's counts and size, or None. line: in the file, 0 where it is of none."""
 
     scene: int
     image: int
@@ -177,77 +182,121 @@ class FoundRegion:
     score: float
     rle: dict[str, Any] | None
     time: float
+    line: int = 0
 
-    def mask(self) -> NDArray[np.bool_] | None:
-        """bool (H, W), None where the file has none."""
+    def mask(self, size: tuple[int, int] | None = None) -> NDArray[np.bool_] | None:
+        """bool (H, W), None where the file has none. size: (width, height) that it must have. Raises PromptError."""
         if self.rle is None:
             return None
         height, width = self.rle["size"]
-        return decode(self.rle, (width, height))
+        return decode(self.rle, size or (width, height))
 
 
 def read_detections(
     path: Path, known: Mapping[tuple[int, int], Collection[int]], objects: Collection[int]
 ) -> dict[tuple[int, int], list[FoundRegion]]:
-    """Read a BOP detections file, by picture. Pictures of the data set that this run leaves out are left out too.
+    """Read a BOP detections file, by picture. known: the data set's pictures; objects: its object numbers.
 
-    Raises InputError, naming the line, for what is malformed, as `read_results` does.
+    Entries that cannot be used are skipped, and told with their line and the reason. Raises InputError where the file
+    is no list of entries, or has some and none that can be used.
     """
     found: dict[tuple[int, int], list[FoundRegion]] = {}
-    seen: dict[str, int] = {}
-    times: dict[tuple[int, int], tuple[float, int]] = {}
+    skipped = _Skipped(path)
+    checker = _RegionChecker(known, objects)
     for line, entry in _entries(path):
-        region = _region(path, line, entry)
-        key = json.dumps(entry, sort_keys=True)
-        if seen.setdefault(key, line) != line:
-            raise InputError(f"{path}, line {line}: the entry repeats line {seen[key]}. Correct the file.")
-        if region.obj_id not in objects:
-            raise InputError(
-                f"{path}, line {line}: category {region.obj_id} is not in the data set, which has {_some(objects)}."
-            )
-        picture = (region.scene, region.image)
-        if picture not in known:
-            raise InputError(f"{path}, line {line}: scene {region.scene} has no image {region.image} in this data set.")
-        first, where = times.setdefault(picture, (region.time, line))
-        if abs(first - region.time) > _SAME_TIME:
-            raise InputError(
-                f"{path}, line {line}: time {region.time:g} differs from {first:g} in line {where} of the same image."
-            )
-        found.setdefault(picture, []).append(region)
+        try:
+            region = checker.region(line, entry)
+        except _Unusable as reason:
+            skipped.tell(line, str(reason))
+            continue
+        found.setdefault((region.scene, region.image), []).append(region)
+    skipped.end(sum(map(len, found.values())))
     return found
 
 
+class _Unusable(Exception):
+    """An entry that is skipped; its text is the reason."""
+
+
+class _Skipped:
+    """Tells of the entries of a file that are skipped: the first ones each, the others by their number."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.count, self.first = path, 0, ""
+
+    def tell(self, line: int, reason: str) -> None:
+        self.count += 1
+        self.first = self.first or f"line {line}: {reason}"
+        if self.count <= _TOLD:
+            log.warning("%s, line %d: the entry is skipped: %s.", self.path, line, reason)
+
+    def end(self, used: int) -> None:
+        """used: entries that are left. Raises InputError where there are none but skipped ones."""
+        if self.count > _TOLD:
+            log.warning("%s: %d entries in all are skipped, %d are used.", self.path, self.count, used)
+        if self.count and not used:
+            raise InputError(f"{self.path} has {self.count} entries and none that can be used; {self.first}.")
+
+
+class _RegionChecker:
+    """Turns entries into regions and remembers what must agree between them."""
+
+    def __init__(self, known: Mapping[tuple[int, int], Collection[int]], objects: Collection[int]) -> None:
+        self.known, self.objects = known, objects
+        self.seen: dict[str, int] = {}
+        self.times: dict[tuple[int, int], tuple[float, int]] = {}
+
+    def region(self, line: int, entry: Any) -> FoundRegion:
+        """Raises _Unusable."""
+        region = _region(line, entry)
+        if region.obj_id not in self.objects:
+            raise _Unusable(f"category {region.obj_id} is not in the data set, which has {_some(self.objects)}")
+        picture = (region.scene, region.image)
+        if picture not in self.known:
+            raise _Unusable(f"scene {region.scene} has no image {region.image} in this data set")
+        key = json.dumps(entry, sort_keys=True)
+        if key in self.seen:
+            raise _Unusable(f"it repeats line {self.seen[key]}")
+        first, where = self.times.setdefault(picture, (region.time, line))
+        if abs(first - region.time) > _SAME_TIME:
+            raise _Unusable(
+                f"time {region.time:g} differs from {first:g} in line {where} of the same image; time is for the whole "
+                "image and the same in all of its entries"
+            )
+        self.seen[key] = line
+        return region
+
+
 _LARGEST = 1e300  # integers beyond are no floats
+_LONGEST = 19  # digits of a number that is given as text
 
 
-def _region(path: Path, line: int, entry: Any) -> FoundRegion:
-    def refuse(reason: str) -> InputError:
-        return InputError(f"{path}, line {line}: {reason}. Correct the file.")
-
+def _region(line: int, entry: Any) -> FoundRegion:
+    """Raises _Unusable."""
     if not isinstance(entry, dict):
-        raise refuse("an entry is {...} with scene_id, image_id, category_id, score, bbox")
+        raise _Unusable("an entry is {...} with scene_id, image_id, category_id, score, bbox")
     missing = [k for k in ("scene_id", "image_id", "category_id", "score", "bbox") if k not in entry]
     if missing:
-        raise refuse(f"{', '.join(missing)} missing")
+        raise _Unusable(f"{', '.join(missing)} missing")
     ids = [
-        int(v) if isinstance(v, str) and v.isascii() and v.isdigit() else v
+        int(v) if isinstance(v, str) and v.isascii() and v.isdigit() and len(v) < _LONGEST else v
         for v in (entry[k] for k in ("scene_id", "image_id", "category_id"))
     ]
     if not all(type(v) is int for v in ids):
-        raise refuse(f"scene_id, image_id and category_id are whole numbers, not {ids}")
+        raise _Unusable(f"scene_id, image_id and category_id are whole numbers, not {ids}")
     box, score, seconds = entry["bbox"], entry["score"], entry.get("time", -1.0)
     if not isinstance(box, list) or len(box) != 4:
-        raise refuse("bbox has four numbers, x, y, width and height")
+        raise _Unusable("bbox has four numbers, x, y, width and height")
     if not all(type(v) in (int, float) and abs(v) < _LARGEST for v in (*box, score, seconds)):
-        raise refuse("bbox, score and time are finite numbers")
+        raise _Unusable("bbox, score and time are finite numbers")
     x, y, w, h = box
     if w <= 0 or h <= 0:
-        raise refuse(f"bbox has the size {w:g}x{h:g}")
+        raise _Unusable(f"bbox has the size {w:g}x{h:g}")
     rle = entry.get("segmentation")
     if rle is not None and not _is_rle(rle):
-        raise refuse("segmentation has size [height, width] and counts that fill it")
+        raise _Unusable("segmentation has size [height, width] and counts that fill it")
     scene, image, obj_id = ids
-    return FoundRegion(scene, image, obj_id, (x, y, x + w, y + h), float(score), rle, float(seconds))
+    return FoundRegion(scene, image, obj_id, (x, y, x + w, y + h), float(score), rle, float(seconds), line)
 
 
 def _is_rle(rle: Any) -> bool:
@@ -269,7 +318,11 @@ def _entries(path: Path) -> Iterator[tuple[int, Any]]:
     decoder = json.JSONDecoder()
     at, line, counted = _skip(text, 0), 1, 0
     if not text[at : at + 1] == "[":
-        raise InputError(f"{path}, line 1: a detections file is a JSON list of entries.")
+        raise InputError(
+            f"{path}, line 1: "
+            "a detections file for a data set is a JSON list of {scene_id, image_id, category_id, "
+            "score, bbox: [x, y, width, height]}, as BOP has it; other forms do not name the scene."
+        )
     at = _skip(text, at + 1)
     while text[at : at + 1] != "]":
         line, counted = line + text.count("\n", counted, at), at
@@ -277,6 +330,8 @@ def _entries(path: Path) -> Iterator[tuple[int, Any]]:
             entry, end = decoder.raw_decode(text, at)
         except json.JSONDecodeError as error:
             raise InputError(f"{path}, line {error.lineno}: {error.msg}. Correct the file.") from error
+        except (ValueError, RecursionError) as error:  # thousands of digits, or of brackets
+            raise InputError(f"{path}, line {line}: {error}. Correct the file.") from error
         yield line, entry
         at = _skip(text, end)
         if text[at : at + 1] == ",":
@@ -295,7 +350,7 @@ def _skip(text: str, at: int) -> int:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise InputError(f"{path} cannot be read: {reason}. Check the path.") from error

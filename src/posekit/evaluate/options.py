@@ -20,7 +20,8 @@ NOT_RESULTS = ("workers",)  # what may differ between two runs of the same resul
 
 @dataclass(frozen=True)
 class EvalOptions:
-    """dataset: a known name, or None. root: its folder. objects: numbers, all where empty. images: (scene, image),
+    """dataset: a known name, or None. root: its folder. units: of BOP's
+    meshes, auto or one of object_model.UNITS. objects: numbers, all where empty. images: (scene, image),
     all where empty. limit: that many pictures, spread evenly. min_visible: instances at least as visible, in [0, 1];
     None is the test's own targets. detections: one of GIVEN, DETECTOR or a JSON file. detector: which one, a name or
     file of weights, as `novel.make_detector` takes it. masks: whether the refiner is given the visible mask. noise:
@@ -31,6 +32,7 @@ class EvalOptions:
     dataset: str | None = None
     root: Path | None = None
     split: str | None = None
+    units: str = "auto"
     objects: tuple[int, ...] = ()
     images: tuple[tuple[int, int], ...] = ()
     limit: int | None = None

@@ -21,7 +21,7 @@ from posekit.evaluate.bop_results import ResultRow, csv_name, read_results, resu
 from posekit.evaluate.options import EvalOptions
 from posekit.evaluate.report import report
 from posekit.evaluate.scoring import Case, Guess, Scored, score
-from posekit.evaluate.stages import Record
+from posekit.evaluate.stages import Record, Regions, detections_for
 from posekit.evaluate.store import RunFolder
 from posekit.evaluate.truths import TruthReader, pictures, selected
 from posekit.evaluate.vsd import VsdMeter
@@ -62,7 +62,7 @@ def evaluate(
     if out.exists() and not out.is_dir():
         raise OutputError(f"{out} is a file: --out names a folder.")
     check_writable(out, f"the output folder {out} cannot be written")
-    data, info = open_dataset(options.dataset, options.root, options.split)
+    data, info = open_dataset(options.dataset, options.root, options.split, options.units)
     wanted = pictures(data, options)
     if not wanted:
         raise ConfigError(f"no picture of {info.title} is left: check --images and the test's targets.")
@@ -84,7 +84,7 @@ def evaluate(
             raise ConfigError("what is to be scored? Pass --csv FILE, a BOP results file.")
         cases, guesses, notes = _from_csv(data, options, wanted, csv)
     else:
-        records = _records(options, folder, wanted, progress)
+        records = _records(options, detections_for(data, options), folder, wanted, progress)
         cases, guesses, notes = _from_records(data, records)
     if not any(c.counted for c in cases):
         raise ConfigError("no instance is left to be found: check --objects and --min-visible.")
@@ -118,7 +118,7 @@ def _check_objects(data: Dataset, options: EvalOptions) -> None:
 
 
 def _records(
-    options: EvalOptions, folder: RunFolder, wanted: Sequence[tuple[int, int]], progress: Progress
+    options: EvalOptions, files: Regions, folder: RunFolder, wanted: Sequence[tuple[int, int]], progress: Progress
 ) -> list[Record]:
     """All records, the missing ones computed."""
     left = [picture for picture in wanted if not folder.has(picture)]
@@ -128,7 +128,7 @@ def _records(
     if done and left:
         log.info("going on after %d of %d pictures", done, len(wanted))
     progress(done, len(wanted))
-    for picture, record in run_pictures(options, left):
+    for picture, record in run_pictures(options, files, left):
         folder.write(picture, record)
         done += 1
         progress(done, len(wanted))

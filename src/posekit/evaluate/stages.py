@@ -6,25 +6,28 @@ numbers come from a seed of the instance's own.
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from posekit.camera import mask_box
+from posekit.camera import Box, mask_box
 from posekit.data.datasets import open_dataset
 from posekit.detect import BoxPrompt, Detector
+from posekit.detect.external import are_corners
 from posekit.detect.prompts import clip_box
-from posekit.detect.segmentation import encode
-from posekit.errors import ConfigError, PromptError
+from posekit.detect.segmentation import encode, xywh
+from posekit.errors import PromptError
 from posekit.estimate import Estimators, PoseEstimator
 from posekit.evaluate.bop_results import FoundRegion, read_detections
 from posekit.evaluate.options import DETECTOR, GIVEN, EvalOptions
 from posekit.evaluate.tracking import Sequences
-from posekit.evaluate.truths import Truth, TruthReader, selected
+from posekit.evaluate.truths import Truth, TruthReader, pictures, selected
 from posekit.geometry import Pose
 from posekit.metrics import box_iou
 from posekit.novel import make_detector
@@ -33,23 +36,24 @@ from posekit.results import Detection, Estimate, Source
 from posekit.search import SearchOptions, find_instances, judged
 from posekit.view import View
 
+log = logging.getLogger("posekit")
+
 Record = dict[str, Any]
+Regions = Mapping[tuple[int, int], Sequence[FoundRegion]]  # by scene and image
 IGNORED_BELOW = 0.1  # visible share below which BOP's detection measures ignore a truth
 
 
 class ImageStage:
-    """Runs a stage on pictures, one after the other; one object in each worker."""
+    """Runs a stage on pictures, one after the other; one object in each worker. files: what `detections_for` read."""
 
-    def __init__(self, options: EvalOptions) -> None:
+    def __init__(self, options: EvalOptions, files: Regions | None = None) -> None:
         self.options = options
-        self.data, self.info = open_dataset(options.dataset, options.root, options.split)
+        self.data, self.info = open_dataset(options.dataset, options.root, options.split, options.units)
         self.truths = TruthReader(self.data)
         self._estimators: Estimators | None = None
         self._sequences = Sequences(self._estimator, "openvino" if options.preset == "lite" else "torch")
-        self._files: Mapping[tuple[int, int], Sequence[FoundRegion]] = {}
+        self._files: Regions = detections_for(self.data, options) if files is None else files
         self._detector: Detector | None = None
-        if options.stage == "estimate" and options.detections not in (*GIVEN, DETECTOR):
-            self._files = detections_for(self.data, options)
 
     def run(self, scene: int, image: int) -> Record:
         """A picture's record: truths, estimates, and how detections overlap with truths."""
@@ -63,12 +67,15 @@ class ImageStage:
             record["estimates"], found = self._detected(view, scene, image)
             record["detections"] = overlaps(found, truths)
             return record
-        record["estimates"] = [] if view is None else self._estimates(view, truths, chosen)
+        regions = [] if view is None else self._regions(view, scene, image)
+        record["estimates"] = [] if view is None else self._estimates(view, truths, chosen, regions)
         if self._files:
-            record["detections"] = overlaps(self._files.get((scene, image), ()), truths)
+            record["detections"] = overlaps(regions, truths)
         return record
 
-    def _estimates(self, view: View, truths: list[Truth], chosen: list[Truth]) -> list[Record]:
+    def _estimates(
+        self, view: View, truths: list[Truth], chosen: list[Truth], regions: Sequence[FoundRegion]
+    ) -> list[Record]:
         if self.options.stage == "refine":
             return [self._refined(view, truth) for truth in chosen]
         if self.options.stage == "track":
@@ -76,8 +83,7 @@ class ImageStage:
         if self.options.detections in GIVEN:
             found = [self._from_truth(view, truth) for truth in chosen]
             return [entry for entry in found if entry is not None]
-        scene, image = truths[0].instance.scene, truths[0].instance.image
-        return self._from_file(view, self._files.get((scene, image), ()))
+        return self._from_file(view, regions)
 
     def _tracked(self, view: View, truths: list[Truth], chosen: list[Truth]) -> list[Record]:
         """Of every object that is not lost, with its state."""
@@ -111,24 +117,23 @@ class ImageStage:
         entries = []
         for obj_id in numbers:
             model = self.data.model(obj_id)
-            detections = [d for r in regions if r.obj_id == obj_id for d in self._told(view, r, model.name)]
+            detections = [_detection(view, r, model.name) for r in regions if r.obj_id == obj_id]
             [found] = find_instances(self._estimators_of, view, [model], detections)
             entries += [_entry(e, obj_id, None) | {"detection_score": _detection_score(e)} for e in found.instances]
         return entries
 
-    def _told(self, view: View, region: FoundRegion, name: str) -> list[Detection]:
-        """A file's region as a detection; none where its box lies outside the picture. Raises ConfigError."""
-        mask = region.mask()
-        if mask is not None and mask.shape != view.image.shape[:2]:
-            raise ConfigError(
-                f"{self.options.detections}: a mask of scene {region.scene}, image {region.image} is "
-                f"{mask.shape[1]}x{mask.shape[0]}, the picture {view.camera.width}x{view.camera.height}."
-            )
-        try:
-            box = clip_box(region.box, view.camera)
-        except PromptError:
-            return []
-        return [Detection(box, mask if mask is not None and mask.any() else None, region.score, name, Source.FILE)]
+    def _regions(self, view: View, scene: int, image: int) -> list[FoundRegion]:
+        """What the file has for a picture; what does not fit the picture is skipped and told."""
+        found = []
+        for region in self._files.get((scene, image), ()):
+            try:
+                clip_box(region.box, view.camera)
+                region.mask(view.camera.size)
+                found.append(region)
+            except PromptError as error:
+                log.warning("%s, line %d (scene %d, image %d): the entry is skipped: %s", self.options.detections,
+                            region.line, scene, image, error)  # fmt: skip
+        return found
 
     def _detected(self, view: View, scene: int, image: int) -> tuple[list[Record], list[FoundRegion]]:
         """Estimates from what the detector finds of the data set's objects, and the detections. As `posekit estimate`
@@ -170,10 +175,30 @@ def disturbed(truth: Truth, estimator: PoseEstimator, options: EvalOptions) -> P
     return options.pose_noise.disturb(i.T_cam_obj @ model.T_obj_ctr, rng) @ model.T_obj_ctr.inverse()
 
 
-def detections_for(data: Any, options: EvalOptions) -> dict[tuple[int, int], list[FoundRegion]]:
-    """A detections file, checked against the whole data set."""
-    known = dict.fromkeys(data.images(), ())
-    return read_detections(Path(options.detections), known, data.model_ids())
+def detections_for(data: Any, options: EvalOptions) -> Regions:
+    """The detections file of the options, by picture, checked against the whole data set; empty where they name none.
+    Raises InputError."""
+    if options.stage != "estimate" or options.detections in (*GIVEN, DETECTOR):
+        return {}
+    found = read_detections(Path(options.detections), dict.fromkeys(data.images(), ()), data.model_ids())
+    here = next((picture for picture in pictures(data, options) if picture in found), None)
+    boxes = [xywh(region.box) for regions in found.values() for region in regions]
+    if here is None or not are_corners(boxes, data.picture_size(*here), options.detections):
+        return found
+    return {k: [replace(r, box=_edges(r)) for r in regions] for k, regions in found.items()}
+
+
+def _edges(region: FoundRegion) -> Box:
+    """What was read as x, y, width, height."""
+    x0, y0, x1, y1 = xywh(region.box)
+    return x0, y0, x1, y1
+
+
+def _detection(view: View, region: FoundRegion, name: str) -> Detection:
+    """A file's region, which fits the picture, as a detection."""
+    mask = region.mask(view.camera.size)
+    box = clip_box(region.box, view.camera)
+    return Detection(box, mask if mask is not None and mask.any() else None, region.score, name, Source.FILE)
 
 
 def _region(detection: Detection, scene: int, image: int, obj_id: int, seconds: float) -> FoundRegion:

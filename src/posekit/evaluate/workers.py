@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from posekit.errors import PosekitError
 from posekit.evaluate.options import EvalOptions
-from posekit.evaluate.stages import ImageStage, Record, run_once
+from posekit.evaluate.stages import ImageStage, Record, Regions, run_once
 
 if TYPE_CHECKING:
     from multiprocessing.context import SpawnProcess
@@ -23,19 +23,19 @@ if TYPE_CHECKING:
 Picture = tuple[int, int]
 
 
-def run_pictures(options: EvalOptions, pictures: Sequence[Picture]) -> Iterator[tuple[Picture, Record]]:
-    """Each picture's record, as soon as it is there; in any order with several workers.
+def run_pictures(options: EvalOptions, files: Regions, pictures: Sequence[Picture]) -> Iterator[tuple[Picture, Record]]:
+    """Each picture's record, as soon as it is there; in any order with several workers. files: `detections_for` them.
 
     Raises what a stage raises, and PosekitError where a worker dies.
     """
     count = min(options.workers, len(pictures))
     if count <= 1:
         with _threads(options.threads):
-            stage = ImageStage(options)
+            stage = ImageStage(options, files)
             for picture in pictures:
                 yield picture, run_once(stage, *picture)
         return
-    pool = _Pool(options, count)
+    pool = _Pool(options, files, count)
     try:
         yield from pool.run(list(pictures))
     finally:
@@ -43,12 +43,12 @@ def run_pictures(options: EvalOptions, pictures: Sequence[Picture]) -> Iterator[
 
 
 class _Pool:
-    def __init__(self, options: EvalOptions, count: int) -> None:
+    def __init__(self, options: EvalOptions, files: Regions, count: int) -> None:
         context = multiprocessing.get_context("spawn")
         self.processes: dict[Connection, SpawnProcess] = {}
         for _ in range(count):
             ours, theirs = context.Pipe()
-            process = context.Process(target=_work, args=(theirs, options), daemon=True)
+            process = context.Process(target=_work, args=(theirs, options, files), daemon=True)
             process.start()
             theirs.close()
             self.processes[ours] = process
@@ -105,7 +105,7 @@ def _threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _work(pipe: Connection, options: EvalOptions) -> None:
+def _work(pipe: Connection, options: EvalOptions, files: Regions) -> None:
     """A worker's life."""
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     stage: ImageStage | None = None
@@ -113,7 +113,7 @@ def _work(pipe: Connection, options: EvalOptions) -> None:
         while True:
             picture = pipe.recv()
             try:
-                stage = stage or ImageStage(options)
+                stage = stage or ImageStage(options, files)
                 answer: Any = run_once(stage, *picture)
             except PosekitError as error:
                 answer = error
