@@ -14,7 +14,7 @@ SOURCE = Path(__file__).resolve().parent.parent / "src" / "posekit"
 # A room (a module of the top level, or a package) and its layer. Imports go down only.
 # Rooms that are planned stand here too; a room that is built must stand here.
 LAYERS = {
-    0: {"geometry", "camera", "files", "lens", "polygons", "pixels", "mesh_files"},
+    0: {"geometry", "camera", "files", "lens", "polygons", "pixels", "mesh_files", "gltf_files", "limits"},
     1: {"view", "object_model", "results", "pose_formats"},
     2: {"load", "calibration", "zoom", "metrics", "pnp", "fusion", "render", "nets", "detect", "draw", "evidence"},
     3: {
@@ -48,10 +48,11 @@ SIBLINGS = {
 }
 SIBLINGS |= {
     ("mesh_files", "polygons"),
+    ("mesh_files", "gltf_files"),
     ("lens", "camera"),
     ("load", "calibration"),
 }  # a lens belongs to a camera, a photograph to a calibration
-SIBLINGS |= {("odometry", "region")}  # a look keeps its outline
+SIBLINGS |= {("odometry", "region"), ("refine", "region")}  # a look keeps its outline, refinement weighs it
 # MV-Net is trained and used with the same views; its search is one of several that give first poses.
 SIBLINGS |= {("data", "view_bank"), ("mvnet_search", "view_bank"), ("mvnet_search", "hypotheses")}
 

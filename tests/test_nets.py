@@ -374,6 +374,19 @@ def test_bad_weights_are_refused(tmp_path: Path) -> None:
         find_weights("paper")
 
 
+@pytest.mark.parametrize(
+    "config", ["size = [1000000000, 96]", 'size = "large"', "widths = [64]", "blocks = 3", "widths = [0, 0]"]
+)
+def test_a_configuration_that_does_not_fit_its_weights_is_refused(tmp_path: Path, config: str) -> None:
+    """Before anything is made of the size that it asks for."""
+    save_networks(tmp_path / "lite", build("lite", SMALL), {})
+    head = (tmp_path / "lite.toml").read_text()
+    start, end = head.index("[config]"), head.index("[about]")
+    (tmp_path / "lite.toml").write_text(f"{head[:start]}[config]\n{config}\n\n{head[end:]}")
+    with pytest.raises(WeightsError, match="makes no networks"):
+        load_networks("lite", tmp_path)
+
+
 def test_the_device_is_one_that_is_there() -> None:
     there = torch.cuda.is_available()
     assert choose_device("cpu") == "cpu" and choose_device("auto") == ("cuda" if there else "cpu")

@@ -67,7 +67,7 @@ class EstimateOptions:
         if self.hypotheses < 1:
             raise ConfigError(f"at least 1 hypothesis is needed, not {self.hypotheses}.")
         if not 1 <= self.top <= self.hypotheses:
-            raise ConfigError(f"top {self.top}: from 1 to {self.hypotheses}, the number of hypotheses.")
+            raise ConfigError(f"top {self.top}: from 1 to {self.hypotheses}, the number of hypotheses (--hypotheses).")
         _ = self.refine_options(True)  # checks the rest
 
     def refine_options(self, dense: bool) -> RefineOptions:

@@ -130,14 +130,14 @@ def load_networks(preset: str, path: Path | None = None) -> Networks:
         state = load_file(file)
     except FileNotFoundError as error:
         raise WeightsError(f"{file.name} needs {about_file.name} beside it: {error}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, SafetensorError) as error:
+    except (OSError, ValueError, RecursionError, SafetensorError) as error:
         raise WeightsError(f"the weights {file} are damaged: {error}. Fetch or train them anew.") from error
     if head.get("preset") != preset:
         raise WeightsError(f"{file} holds weights of preset {head.get('preset')!r}, not {preset!r}.")
     digest = hashlib.sha256(data).hexdigest()[:16]
     if digest != head.get("sha256_16"):
         raise WeightsError(f"{file} and {about_file.name} do not belong together (hash {digest}). Fetch them anew.")
-    networks = build(preset, _config(preset, head.get("config", {})))
+    networks = _built(preset, head.get("config", {}), state, file)
     has_mvnet = any(k.startswith("mvnet.") for k in state)
     _load_strictly(networks.svnet, {k[6:]: v for k, v in state.items() if k.startswith("svnet.")}, file)
     if networks.mvnet is not None and has_mvnet:
@@ -149,6 +149,23 @@ def load_networks(preset: str, path: Path | None = None) -> Networks:
     if mvnet is not None:
         mvnet.eval()
     return dataclasses.replace(networks, mvnet=mvnet, digest=digest, about=head.get("about", {}))
+
+
+def _built(preset: str, values: Any, state: Mapping[str, Tensor], file: Path) -> Networks:
+    """The networks of a configuration, made where their parameters are those of the file. Raises WeightsError.
+
+    First without memory: sizes that a file states may be any."""
+    try:
+        config = _config(preset, values)
+        with torch.device("meta"):
+            parameters = sum(v.numel() for v in build(preset, config).svnet.state_dict().values())
+        stored = sum(v.numel() for k, v in state.items() if k.startswith("svnet."))
+        if parameters != stored:
+            raise ValueError(f"its networks have {parameters} numbers, the file {stored}")
+        return build(preset, config)
+    except (TypeError, ValueError, IndexError, AttributeError, OverflowError, ZeroDivisionError, RuntimeError) as error:
+        first = str(error).partition("\n")[0]
+        raise WeightsError(f"the configuration of the weights {file} makes no networks ({first}).") from error
 
 
 def _config(preset: str, values: Mapping[str, Any]) -> LiteConfig | PaperConfig:

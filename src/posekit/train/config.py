@@ -149,7 +149,7 @@ def read_config(path: Path) -> TrainConfig:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise ConfigError(f"there is no configuration {path}.") from error
-    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:  # also thousands of digits, or of brackets
         raise ConfigError(f"{path} is no readable TOML file: {error}") from error
     return changed(default_config(str(values.get("recipe", "lite"))), values, str(path))
 
@@ -187,7 +187,10 @@ def _like(present: Any, value: Any, where: str) -> Any:
             raise ConfigError(f"{where} is a list{f' of {len(present)}' if present else ''}, not {value!r}.")
         return tuple(_like(present[0] if present else "", v, where) for v in value)
     if isinstance(present, float) and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError as error:
+            raise ConfigError(f"{where} is a float, not a number of {len(str(value))} digits.") from error
     if type(value) is not type(present):
         raise ConfigError(f"{where} is a {type(present).__name__}, not {value!r}.")
     return value
