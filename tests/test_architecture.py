@@ -49,6 +49,7 @@ SIBLINGS = {
 SIBLINGS |= {
     ("mesh_files", "polygons"),
     ("mesh_files", "gltf_files"),
+    ("gltf_files", "pixels"),
     ("lens", "camera"),
     ("load", "calibration"),
 }  # a lens belongs to a camera, a photograph to a calibration

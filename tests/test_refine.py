@@ -149,10 +149,28 @@ def test_a_small_angle_beside_a_large_correction_is_no_convergence(renderer) -> 
     assert found.iterations == 1, "the regressed update has the angle head alone"
 
 
+class Wandering(Oracle):
+    """Sees the object turned by 3 degrees about the view, to one side and then to the other."""
+
+    def predict(self, observed: Sequence[View], rendered: Sequence[View]) -> list[PairPrediction]:
+        turn = Pose.rotation(so3_exp([0.0, 0.0, np.deg2rad(3.0 if self.calls % 2 else -3.0)]))
+        self.truth = turn @ self.truth
+        return super().predict(observed, rendered)
+
+
+def test_a_pose_at_rest_ends_the_loop(renderer) -> None:
+    model = bracket()
+    truth = Pose(view_rotation([0.5, -1.0, 0.6]), PLACES[0]) @ model.T_obj_ctr.inverse()
+    start = Pose(so3_exp([0, 0, 0.3]) @ truth.R, truth.t)
+    oracle = Oracle(model, truth, angles=[0.5, 0.5])
+    found = refine(photograph(renderer, model, truth), model, [start], oracle, renderer)[0]
+    assert found.iterations == 2 and not found.converged and errors(found.T_cam_obj, truth)[0] < 0.1
+
+
 def test_without_convergence_the_lowest_predicted_angle_wins(renderer) -> None:
     model = bracket()
     truth = Pose(view_rotation([0.5, -1.0, 0.6]), PLACES[0]) @ model.T_obj_ctr.inverse()
-    oracle = Oracle(model, truth, angles=[0.5, 0.2, 0.4, 0.3])
+    oracle = Wandering(model, truth, angles=[0.5, 0.2, 0.4, 0.3])
     options = RefineOptions(iterations=4, last_update=False)
     found = refine(photograph(renderer, model, truth), model, [truth], oracle, renderer, options)[0]
     assert not found.converged and found.iterations == 4 and oracle.calls == 4
@@ -162,7 +180,7 @@ def test_without_convergence_the_lowest_predicted_angle_wins(renderer) -> None:
 def test_patience_ends_a_loop_that_no_longer_improves(renderer) -> None:
     model = bracket()
     truth = Pose(view_rotation([0.5, -1.0, 0.6]), PLACES[0]) @ model.T_obj_ctr.inverse()
-    oracle = Oracle(model, truth, angles=[0.5, 0.2, 0.4, 0.3, 0.1, 0.3, 0.3, 0.3, 0.01])
+    oracle = Wandering(model, truth, angles=[0.5, 0.2, 0.4, 0.3, 0.1, 0.3, 0.3, 0.3, 0.01])
     options = RefineOptions(patience=3)
     found = refine(photograph(renderer, model, truth), model, [truth], oracle, renderer, options)[0]
     assert found.iterations == 8 and not found.converged and found.angle == 0.1

@@ -315,8 +315,7 @@ def load_pose(path: str | Path) -> Pose:
     )
     try:
         text = path.read_text(encoding="utf-8-sig")
-        in_json = text.lstrip().startswith(("{", "["))
-        pose = _pose_from_json(json.loads(text), path, needed) if in_json else pose_from_text(text)
+        pose = _pose_from_json(json.loads(text), path, needed) if "{" in text else pose_from_text(text)
     except OSError as error:
         raise PromptError(f"the pose file {path} cannot be read ({error.strerror}): check the path.") from error
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
@@ -332,8 +331,6 @@ def _pose_from_json(data: Any, path: Path, needed: str) -> Pose:
         if not data["estimates"]:
             raise PromptError(f"the result {path} has no estimates, so there is no pose to start from: {needed}")
         data = data["estimates"][0]
-    if isinstance(data, list):
-        return Pose.from_matrix(data)
     if not isinstance(data, dict):
         raise ValueError("its outermost part is not {...}")
     if "T_cam_obj" in data:
