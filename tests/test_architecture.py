@@ -50,6 +50,7 @@ SIBLINGS |= {
     ("mesh_files", "polygons"),
     ("mesh_files", "gltf_files"),
     ("gltf_files", "pixels"),
+    ("gltf_files", "limits"),
     ("lens", "camera"),
     ("load", "calibration"),
 }  # a lens belongs to a camera, a photograph to a calibration

@@ -502,7 +502,7 @@ def command(*args: object) -> subprocess.Popen[str]:
 def test_another_run_is_not_overwritten(alone: Path, root: Path, tmp_path: Path) -> None:
     result = run("--stage", "refine", "--root", root, "--out", alone, *QUICK_ARGS, "--seed", "3")
     assert result.exit_code == 1
-    assert "holds an evaluation with other estimate: pass another --out, or --force" in " ".join(result.output.split())
+    assert "holds an evaluation with other seed: pass another --out, or --force" in " ".join(result.output.split())
     (tmp_path / "mine.txt").write_text("keep")
     with pytest.raises(OutputError, match="holds files, but no evaluation"):
         evaluate(EvalOptions("refine", root=root, estimate=QUICK), tmp_path, force=True)

@@ -14,9 +14,8 @@ from posekit.errors import WeightsError
 from posekit.geometry import Pose, random_rotation, rotation_angle, so3_exp
 from posekit.hypotheses import BoxSearch, Judge, MVNetSearch, TemplateSearch, agreement_of
 from posekit.nets.heads import Prediction
-from posekit.nets.lite import LiteConfig
 from posekit.nets.pose_delta import delta_between
-from posekit.nets.weights import build
+from posekit.nets.weights import PaperConfig, build
 from posekit.refine import crops
 from posekit.render import Light, Renderer
 from posekit.results import Detection, Source
@@ -119,7 +118,7 @@ def test_mvnet_answers_relative_to_the_frontal_view(renderer: Renderer) -> None:
     model = bracket()
     truth = Pose(random_rotation(np.random.default_rng(3)), [0.25, -0.15, 0.8]) @ model.T_obj_ctr.inverse()
     view, detection = seen(renderer, truth)
-    networks = build("lite", LiteConfig(widths=(16, 32), blocks=1, fine=16))
+    networks = build("paper", PaperConfig((160, 120), 0.125))
     search = MVNetSearch(model, networks, renderer)
     zoom = zoom_to_box(CAMERA, detection.box, networks.size)
     target = Pose.rotation(zoom.R_view_cam) @ truth @ model.T_obj_ctr
@@ -139,7 +138,7 @@ def test_mvnet_answers_relative_to_the_frontal_view(renderer: Renderer) -> None:
 
 
 def test_mvnet_views_are_the_six_faces(renderer: Renderer) -> None:
-    networks = build("lite", LiteConfig(widths=(16, 32), blocks=1, fine=16))
+    networks = build("paper", PaperConfig((160, 120), 0.125))
     search = MVNetSearch(bracket(), networks, renderer)
     looking = np.stack([R[2] for R in search.rotations])  # the optical axis in the object's frame
     np.testing.assert_allclose(looking @ looking.T, np.round(looking @ looking.T), atol=1e-12)
