@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from posekit.geometry import Pose, so3_exp
@@ -21,3 +22,11 @@ def differences(function: Callable[[Array], Array], size: int, step: float = 1e-
     """Central differences of a function of (size,) about zero; (..., size)."""
     columns = [(function(step * e) - function(-step * e)) / (2 * step) for e in np.eye(size)]
     return np.stack(columns, axis=-1)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What is kept between runs of posekit goes into a folder of the tests, here and in the processes they start."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
