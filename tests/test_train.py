@@ -34,6 +34,7 @@ from posekit.data.augment import AugmentConfig
 from posekit.data.bop import BopDataset
 from posekit.data.scenes import SceneConfig
 from posekit.data.stream import PairStream, StreamConfig
+from posekit.data.view_queries import QueryConfig
 from posekit.errors import ConfigError, OutputError, TrainingError, WeightsError
 from posekit.geometry import Pose, random_rotation
 from posekit.nets.flownet import LAYERS
@@ -61,7 +62,9 @@ from posekit.train.pose import make_task, resume_pose, train_pose
 from posekit.train.sources import Sources
 
 SMALL = LiteConfig(widths=(16, 32), blocks=1, fine=16)
-STREAM = StreamConfig(batch=2, shard=2, pool=16, per_object=4, mvnet=1)
+STREAM = StreamConfig(
+    batch=2, shard=2, pool=16, per_object=4, mvnet=1, queries=QueryConfig(drawn=3, templates=8, kept=4, nearest=2)
+)
 CONFIG = TrainConfig(
     steps=4, validate=100, save=2, log=1, cases=1, calibrate=0, stream=STREAM, lite=SMALL,
     optimiser=OptimiserConfig(warmup=2), machine=MachineConfig("cpu", workers=0, threads=1, precision="32-true"),
@@ -173,7 +176,7 @@ def test_a_training_killed_twice_ends_as_one_that_was_not(tmp_path: Path) -> Non
     train_pose(dataclasses.replace(config, machine=MachineConfig("cpu", threads=1, workers=0)), whole)
     for step in (3, 8):
         process = start(config, killed)
-        for _ in range(2000):
+        for _ in range(6000):
             if (Checkpoints(killed / "checkpoints").last() or 0) >= step:
                 break
             time.sleep(0.02)
@@ -308,7 +311,8 @@ def paper_trainer(out: Path, config: TrainConfig = PAPER) -> Trainer:
 
 def test_the_papers_recipe_overfits_a_batch(tmp_path: Path) -> None:
     it = paper_trainer(tmp_path, changed(PAPER, {"stream": {"batch": 4, "pool": 8}}, "here"))
-    it.task.prepare(it._batches)
+    batches = it._batches(0)
+    it.task.prepare([next(batches) for _ in range(it.task.measured)])
     batch = next(it._batches(0))
     values = [it.train_step(batch, 0.0) for _ in range(80)]
     assert values[-1]["mv_loss"] < 0.7 * values[0]["mv_loss"]
@@ -482,7 +486,7 @@ def test_a_configuration_is_what_its_file_says(tmp_path: Path) -> None:
         ("[lite]\nsize = [1]", "size is a list of 2"),
         ("steps = 0", "at least 1"),
         ("[optimiser]\nrate = -1.0", "positive"),
-        ("[stream]\nmvnet = 3", "multiple of the batch's 4 shards"),
+        ("[stream]\nshard = 8\nmvnet = 3", "multiple of the batch's 4 shards"),
         ("a = [", "no readable TOML"),
     ],
 )

@@ -115,7 +115,7 @@ class TrainConfig:
     optimiser: OptimiserConfig = OptimiserConfig()
     machine: MachineConfig = MachineConfig()
     sources: SourceConfig = SourceConfig()
-    stream: StreamConfig = StreamConfig()
+    stream: StreamConfig = StreamConfig(shard=32, mvnet=8)
     lite: LiteConfig = LiteConfig()
     loss: DenseLossConfig = DenseLossConfig()
     paper: PaperConfig = field(default_factory=PaperConfig)
