@@ -152,17 +152,18 @@ def load_networks(preset: str, path: Path | None = None) -> Networks:
 
 
 def _built(preset: str, values: Any, state: Mapping[str, Tensor], file: Path) -> Networks:
-    """The networks of a configuration, made where their parameters are those of the file. Raises WeightsError.
+    """The networks of a configuration, without memory for their parameters, which the file's take the place of.
 
-    First without memory: sizes that a file states may be any."""
+    Raises WeightsError where a configuration makes none, or networks with other parameters than the file holds.
+    """
     try:
-        config = _config(preset, values)
         with torch.device("meta"):
-            parameters = sum(v.numel() for v in build(preset, config).svnet.state_dict().values())
+            networks = build(preset, _config(preset, values))
+        parameters = sum(v.numel() for v in networks.svnet.state_dict().values())
         stored = sum(v.numel() for k, v in state.items() if k.startswith("svnet."))
         if parameters != stored:
             raise ValueError(f"its networks have {parameters} numbers, the file {stored}")
-        return build(preset, config)
+        return networks
     except (TypeError, ValueError, IndexError, AttributeError, OverflowError, ZeroDivisionError, RuntimeError) as error:
         first = str(error).partition("\n")[0]
         raise WeightsError(f"the configuration of the weights {file} makes no networks ({first}).") from error
@@ -183,6 +184,6 @@ def _load_strictly(module: nn.Module, state: dict[str, Tensor], file: Path) -> N
     if not all(torch.isfinite(v).all() for v in state.values() if v.is_floating_point()):
         raise WeightsError(f"the weights {file} hold numbers that are not finite.")
     try:
-        module.load_state_dict(state, strict=True)
+        module.load_state_dict(state, strict=True, assign=True)
     except RuntimeError as error:
         raise WeightsError(f"the weights {file} do not fit the network: {error}") from error
