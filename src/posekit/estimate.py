@@ -33,7 +33,7 @@ from posekit.view import View
 
 INITS = ("templates", "mvnet")
 AUTO = "auto"  # correspondences where the network gives them, else the regressed delta
-STRUCTURE, BLUR, ANGLE, BIAS = 4.0, -1.4, -1.6, 1.2  # of `presence`, fitted: docs/decisions/0020
+STRUCTURE, BLUR, ANGLE, BIAS = 5.7, -1.6, -1.6, 1.2  # of `presence`, fitted: docs/decisions/0020
 SMALLEST = 0.3  # degrees: smaller predicted errors say no more
 USUAL = 2.0  # pixels of the crop: the correspondences' expected error, where the network gives none
 FIRST, SEMIFINALISTS, HEATS, FINALISTS = 1, 4, 3, 2  # iterations after which only so many hypotheses go on
