@@ -247,7 +247,7 @@ def test_a_mesh_in_metres_is_told_by_the_stated_diameter(
     put(root / "models" / "models_info.json", {} if stated is None else {"5": {"diameter": 1000 * long}})
     model = BopDataset(root).model(5)
     assert model.diameter == pytest.approx(long if stated else long / 1000, rel=1e-5)
-    assert ("taken for metres, 2100 mm long" if stated else "where it is in metres") in caplog.text
+    assert ("taken for metres, 2100 mm long" if stated else "where it is in another unit") in caplog.text
 
 
 def test_a_diameter_stated_in_metres_is_measured(root: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -266,13 +266,13 @@ def test_a_stated_diameter_of_something_else_is_told(root: Path, caplog: pytest.
 @pytest.mark.parametrize(("units", "scale"), [("mm", 1.0), ("m", 1000.0), ("cm", 10.0)])
 def test_units_that_are_given_are_taken(units: str, scale: float, root: Path, caplog: pytest.LogCaptureFixture) -> None:
     """Also where models_info.json tells another story."""
-    stated = BopDataset(root).model(1).diameter
+    stated = BopDataset(root).model(5).diameter
     for path in (root / "models").glob("obj_*.ply"):
         mesh = trimesh.load(path, process=False)
         mesh.apply_scale(1 / scale)
         mesh.export(path)
     caplog.clear()
-    assert BopDataset(root, units=units).model(1).diameter == pytest.approx(stated, rel=1e-5)
+    assert BopDataset(root, units=units).model(5).diameter == pytest.approx(stated, rel=1e-5)
     assert not caplog.records
 
 

@@ -399,7 +399,7 @@ def test_auto_decides_by_the_diameter_and_says_so(
         (
             102.0,
             "m",
-            r"duck.ply has a diameter of 102 m; posekit works in metres: give --units mm \(units='mm' in Python\)",
+            r"duck.ply has a diameter of 102 m; posekit works in metres: give --units mm or --units cm",
         ),
         (0.5, "mm", r"has a diameter of 0.5 mm; posekit works in metres: give --units m or --units cm"),
         (50_000.0, "auto", "from 1 mm to 10 m: scale the mesh"),

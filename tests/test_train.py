@@ -168,8 +168,9 @@ def final(out: Path, step: int) -> dict[str, torch.Tensor]:
 
 
 def test_a_training_killed_twice_ends_as_one_that_was_not(tmp_path: Path) -> None:
+    stream = dataclasses.replace(STREAM, mvnet=0)  # the workers begin sooner
     config = dataclasses.replace(
-        CONFIG, steps=14, save=1, keep=2, cases=0, machine=MachineConfig("cpu", threads=1, workers=1)
+        CONFIG, steps=14, save=1, keep=2, cases=0, machine=MachineConfig("cpu", threads=1, workers=1), stream=stream
     )
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     # a stream made in this process has one lane of data, as one worker has

@@ -108,7 +108,7 @@ def test_a_title_that_is_no_text_stops_no_video(tmp_path: Path) -> None:
     data = path.read_bytes()
     assert b"TITLE" in data
     path.write_bytes(data.replace(b"TITLE", b"T\x96TLE"))
-    assert len([frame for frame in open_frames(str(path), "100,100,48,32") if frame.problem is None]) == 3
+    assert len([frame for frame in open_frames(str(path), "100,100,48,32") if not frame.problem]) == 3
 
 
 def test_damaged_frames_do_not_end_a_video(tmp_path: Path) -> None:
