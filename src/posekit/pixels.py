@@ -106,6 +106,6 @@ def orientation(image: Image.Image) -> int:
     try:
         with warnings.catch_warnings(action="ignore"):
             found = image.getexif().get(ExifTags.Base.Orientation, 1)
-    except Exception:
+    except Exception:  # Pillow raises what its parser stumbles over, and metadata never stop a good picture
         return 1
     return found if isinstance(found, int) and 1 <= found <= 8 else 1

@@ -18,7 +18,8 @@ from posekit.object_model import ObjectModel
 Image = NDArray[np.uint8]
 Rng = np.random.Generator
 
-KINDS = ("plain", "one colour", "washed out", "vertex colours", "other paint")
+FADED = ("plain", "one colour", "washed out", "vertex colours")  # what `faded` makes
+KINDS = (*FADED, "other paint")
 SHARES = (0.4, 0.12, 0.12, 0.16, 0.2)
 
 

@@ -8,7 +8,7 @@ number comes from the generator given.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from posekit.camera import Box, Camera
+from posekit.data.appearance import FADED, faded
 from posekit.data.augment import AugmentConfig, composed
 from posekit.data.pairs import random_light
-from posekit.data.procedural import random_colour
 from posekit.geometry import Pose, fibonacci_sphere, random_rotation, rotation_between
 from posekit.nets.mvnet import CELL, GRID, NONE
 from posekit.object_model import ObjectModel
@@ -119,7 +119,7 @@ def training_bank(
 
     around: where given, only config.drawn of the directions are drawn, those nearest to the scenes' first.
     """
-    look = recoloured(model, rng) if rng.random() < config.plain else model
+    look = faded(model, str(rng.choice(FADED)), rng) if rng.random() < config.plain else model
     directions = fibonacci_sphere(config.views)
     if len(around):
         directions = directions[_near_directions(directions, around, config, rng)]
@@ -134,19 +134,6 @@ def _near_directions(
     wanted = np.argsort(-facing, axis=1)[:, :2].T.ravel()
     order = list(dict.fromkeys([int(i) for i in wanted] + [int(i) for i in rng.permutation(len(directions))]))
     return np.array(order[: config.drawn], dtype=np.int64)
-
-
-def recoloured(model: ObjectModel, rng: Rng) -> ObjectModel:
-    """The mesh plain, of one colour, or in colours that have to do with its shape only."""
-    kind = rng.random()
-    if kind < 0.5:
-        return replace(model, colors=None, uvs=None, texture=None)
-    colour = random_colour(rng)
-    colours = np.broadcast_to(colour, (len(model.vertices), 3))
-    if kind > 0.8:
-        along = (model.vertices - model.center) @ rng.normal(size=3) / model.diameter
-        colours = colour + (random_colour(rng) - colour) * (0.5 + along[:, None]).clip(0, 1)
-    return replace(model, colors=colours.clip(0, 255).astype(np.uint8), uvs=None, texture=None)
 
 
 def rough_box(box: Box, config: QueryConfig, rng: Rng) -> Box:
@@ -174,7 +161,7 @@ def render_queries(
     renderer: Renderer, model: ObjectModel, count: int, config: QueryConfig, rng: Rng
 ) -> list[QueryScene]:
     """At most ``count`` crops of an object from all sides; those in which hardly anything is seen are left out."""
-    look = recoloured(model, rng) if rng.random() < config.plain_scene else model
+    look = faded(model, str(rng.choice(FADED)), rng) if rng.random() < config.plain_scene else model
     whole = Camera.from_fov(0.8, 640, 480)
     outline = model.outline - model.center
     poses, cameras = [], []
