@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from posekit.data.bop import BopDataset
-from posekit.estimate import Estimators
-from posekit.novel import make_detector
-from posekit.object_model import ObjectModel
-from posekit.search import SearchOptions, find_instances
+from posekit.datasets.bop import BopDataset
+from posekit.detect.novel import make_detector
+from posekit.estimate.estimator import Estimators
+from posekit.estimate.instances import SearchOptions, find_instances
+from posekit.mesh.model import ObjectModel
 
 
 def main() -> None:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from posekit.data.bop import BopDataset
+from posekit.datasets.bop import BopDataset
 from posekit.detect.prompts import clip_box, filled_mask, grabcut_mask
 
 NAMES = ("filled", "grabcut")

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from posekit.camera import Box, mask_box
-from posekit.data.bop import BopDataset
+from posekit.datasets.bop import BopDataset
 from posekit.detect.coco import Found, Truth, average_precision
-from posekit.novel import make_detector
+from posekit.detect.novel import make_detector
 from posekit.results import Detection
 
 LEAST = 0.1

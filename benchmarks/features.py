@@ -22,12 +22,12 @@ import cv2
 import numpy as np
 
 from posekit.camera import Box, Camera, mask_box
-from posekit.data.bop import BopDataset
-from posekit.data.procedural import photo_crop, random_object
-from posekit.features import FeatureOptions, FeaturePose, FeatureSearch
+from posekit.datasets.bop import BopDataset
+from posekit.first_pose.features import FeatureOptions, FeaturePose, FeatureSearch
 from posekit.geometry import Pose, random_rotation, rotation_angle
-from posekit.object_model import ObjectModel
+from posekit.mesh.model import ObjectModel
 from posekit.render import Light, Renderer
+from posekit.synth.procedural import photo_crop, random_object
 from posekit.view import View
 
 CAMERA = Camera(600.0, 600.0, 319.5, 239.5, 640, 480)

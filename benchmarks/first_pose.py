@@ -20,18 +20,18 @@ from pathlib import Path
 import numpy as np
 
 from posekit.camera import Box, mask_box
-from posekit.data.augment import AugmentConfig, observe
-from posekit.data.bop import BopDataset
-from posekit.data.procedural import random_object
-from posekit.data.scenes import SceneConfig, render_scenes, view_of
-from posekit.data.stream import load_photos
+from posekit.datasets.bop import BopDataset
 from posekit.detect.prompts import BoxPrompt, clip_box
+from posekit.first_pose.hypotheses import BoxSearch, TemplateSearch
 from posekit.geometry import Pose
-from posekit.hypotheses import BoxSearch, TemplateSearch
+from posekit.mesh.model import ObjectModel
 from posekit.metrics import pose_error
-from posekit.object_model import ObjectModel
 from posekit.render import Renderer
 from posekit.results import Detection
+from posekit.synth.procedural import random_object
+from posekit.train.data.augment import AugmentConfig, observe
+from posekit.train.data.crops import SceneConfig, render_scenes, view_of
+from posekit.train.data.stream import load_photos
 from posekit.view import View
 
 BEST = (1, 3, 5, 10)

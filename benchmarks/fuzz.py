@@ -368,39 +368,39 @@ def weights() -> list[Case]:
 
 
 def read_image(path: Path) -> object:
-    from posekit.load import load_view
+    from posekit.io.load import load_view
 
     return load_view(path)
 
 
 def read_mask(path: Path) -> object:
-    from posekit.load import load_mask
+    from posekit.io.load import load_mask
 
     return load_mask(path, SIZE)
 
 
 def read_mesh(path: Path) -> object:
-    from posekit.object_model import ObjectModel
+    from posekit.mesh.model import ObjectModel
 
     model = ObjectModel.load(path)
     return model.diameter, model.outline
 
 
 def read_camera(path: Path) -> object:
-    from posekit.calibration import load_calibration
+    from posekit.io.calibration import load_calibration
 
     return load_calibration(path, SIZE, "000003.png").undistorted(_picture())
 
 
 def read_pose(path: Path) -> object:
-    from posekit.load import load_pose
+    from posekit.io.load import load_pose
 
     return load_pose(path)
 
 
 def _view_and_model() -> Any:
     from posekit.camera import Camera
-    from posekit.object_model import ObjectModel
+    from posekit.mesh.model import ObjectModel
     from posekit.view import View
 
     model = ObjectModel.from_arrays([[0.1 * v for v in vertex] for vertex in VERTICES], FACES, name="obj_000006")
@@ -415,7 +415,7 @@ def read_detections(path: Path) -> object:
 
 
 def read_results(path: Path) -> object:
-    from posekit.evaluate import bop_results
+    from posekit.datasets import results_csv as bop_results
 
     known = {(2, 3): [6], (2, 8): [6]}
     if path.suffix == ".csv":
@@ -425,8 +425,8 @@ def read_results(path: Path) -> object:
 
 
 def read_bop(path: Path) -> object:
-    from posekit.data.bop import BopDataset
-    from posekit.video import open_frames
+    from posekit.datasets.bop import BopDataset
+    from posekit.io.video import open_frames
 
     data = BopDataset(path)
     model = data.measured_model(1)
@@ -436,7 +436,7 @@ def read_bop(path: Path) -> object:
 
 
 def read_video(path: Path) -> object:
-    from posekit.video import open_frames
+    from posekit.io.video import open_frames
 
     return [frame.problem for frame, _ in zip(open_frames(str(path), "60,60,31.5,23.5"), range(20), strict=False)]
 

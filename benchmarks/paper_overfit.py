@@ -19,19 +19,19 @@ import numpy as np
 import torch
 
 from posekit.camera import Camera, mask_box
-from posekit.data.bop import BopDataset
-from posekit.data.procedural import noise_image, random_object
-from posekit.data.scenes import SceneConfig, disturbed_box, disturbed_pose
+from posekit.datasets.bop import BopDataset
+from posekit.estimate.refine import RefineOptions, refine
+from posekit.first_pose.hypotheses import MVNetSearch
 from posekit.geometry import Pose, random_rotation
-from posekit.hypotheses import MVNetSearch
+from posekit.mesh.model import ObjectModel
 from posekit.metrics import pose_error, within
 from posekit.nets.predictor import NetworkPredictor
 from posekit.nets.weights import load_networks
-from posekit.object_model import ObjectModel
-from posekit.refine import RefineOptions, refine
 from posekit.render import Renderer
 from posekit.results import Detection
+from posekit.synth.procedural import noise_image, random_object
 from posekit.train.config import changed, default_config
+from posekit.train.data.crops import SceneConfig, disturbed_box, disturbed_pose
 from posekit.train.loop import Progress, Trainer, make_fabric
 from posekit.train.pose import make_task
 from posekit.train.sources import Sources

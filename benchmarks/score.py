@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from posekit.data.bop import BopDataset
-from posekit.data.datasets import dataset_info
+from posekit.datasets.bop import BopDataset
+from posekit.datasets.registry import dataset_info
 from posekit.evaluate.scoring import Case, Guess, score
 from posekit.geometry import Pose, PoseNoise, random_rotation
 

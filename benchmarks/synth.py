@@ -19,12 +19,12 @@ import cv2
 
 os.environ.setdefault("LP_NUM_THREADS", "0")  # as a worker process: no threads of its own
 
-from posekit.data.bop_writer import BopWriter
-from posekit.data.procedural import random_object
-from posekit.data.synth.objects import read_objects
-from posekit.data.synth.plan import KINDS, SynthConfig
-from posekit.data.synth.run import begin, make_maker
-from posekit.object_model import ObjectModel
+from posekit.datasets.bop_writer import BopWriter
+from posekit.mesh.model import ObjectModel
+from posekit.synth.objects import read_objects
+from posekit.synth.plan import KINDS, SynthConfig
+from posekit.synth.procedural import random_object
+from posekit.synth.run import begin, make_maker
 
 WARM = 4  # images before the clock starts: shaders, textures and kernels are made
 

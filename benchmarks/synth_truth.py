@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from posekit.data.bop import BopDataset
+from posekit.datasets.bop import BopDataset
+from posekit.datasets.results_csv import ResultRow, results_csv
 from posekit.evaluate import evaluate
-from posekit.evaluate.bop_results import ResultRow, results_csv
 from posekit.evaluate.options import EvalOptions
 from posekit.render import Renderer
 

@@ -31,15 +31,15 @@ import numpy as np
 from scipy.stats import spearmanr
 
 from posekit.camera import mask_box
-from posekit.data.bop import BopDataset, Instance
-from posekit.estimate import PoseEstimator
+from posekit.datasets.bop import BopDataset, Instance
+from posekit.estimate.estimator import PoseEstimator
 from posekit.evaluate.charts import Axes, lines
 from posekit.geometry import Pose, rotation_angle
+from posekit.io.video import ReadAhead, SceneFrames, VideoFrames, VideoWriter
+from posekit.mesh.model import ObjectModel
 from posekit.metrics import pose_error
-from posekit.object_model import ObjectModel
 from posekit.results import Detection, Source
-from posekit.track import LOST, RESTARTED, TRACKED, TrackConfig, Tracked, Tracker
-from posekit.video import ReadAhead, SceneFrames, VideoFrames, VideoWriter
+from posekit.tracking.tracker import LOST, RESTARTED, TRACKED, TrackConfig, Tracked, Tracker
 from posekit.view import View
 
 SEEN, HALF = 0.1, 0.5

@@ -6,11 +6,11 @@ The data set is made here (`posekit synth` does the same); LM-O or your own are 
 import sys
 from pathlib import Path
 
-from posekit.data.example import locomotive
-from posekit.data.synth.plan import SynthConfig
-from posekit.data.synth.run import Machines, begin, run
 from posekit.evaluate.options import EvalOptions
 from posekit.evaluate.run import evaluate
+from posekit.synth.example import locomotive
+from posekit.synth.plan import SynthConfig
+from posekit.synth.run import Machines, begin, run
 
 
 def main() -> None:

@@ -3,8 +3,9 @@
 import sys
 from pathlib import Path
 
-from posekit import Renderer, draw, estimate
-from posekit.data.example import make_example, ply
+from posekit import Renderer, estimate
+from posekit.synth.example import make_example, ply
+from posekit.visualise import draw
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else "posekit-out/one_picture")
 out.mkdir(parents=True, exist_ok=True)

@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from posekit import Camera, Pose, Renderer, draw
-from posekit.data.example import locomotive
+from posekit import Camera, Pose, Renderer
 from posekit.geometry import euler_xyz
 from posekit.render import render_views, view_rotations
+from posekit.synth.example import locomotive
+from posekit.visualise import draw
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else "posekit-out/render_views")
 out.mkdir(parents=True, exist_ok=True)

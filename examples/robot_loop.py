@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from posekit import Camera, ObjectModel, PoseEstimator, Renderer, estimate
-from posekit.data.example import make_film
-from posekit.track import Tracker
+from posekit.synth.example import make_film
+from posekit.tracking.tracker import Tracker
 
 FRAMES = int(sys.argv[1]) if len(sys.argv) > 1 else 30
 FILM = list(make_film(Renderer(), FRAMES))
@@ -21,7 +21,7 @@ T_BASE_CAM = np.array([[1, 0, 0, 0.4], [0, 0, 1, -0.6], [0, -1, 0, 0.3], [0, 0, 
 
 
 def frames() -> Iterator[NDArray[np.uint8]]:
-    """uint8 RGB (480, 640, 3), newest last. Yours: the camera's driver; `posekit.video.open_frames("0")`."""
+    """uint8 RGB (480, 640, 3), newest last. Yours: the camera's driver; `posekit.io.video.open_frames("0")`."""
     for k, example in enumerate(FILM):
         hidden = k == FRAMES // 2  # once something is in the way
         yield np.full_like(example.view.image, 90) if hidden else example.view.image

@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from posekit import Renderer, draw, estimate, figures
-from posekit.data.example import locomotive
-from posekit.data.tabletop import TabletopConfig, compose, procedural_objects
-from posekit.estimate import Estimators
+from posekit import Renderer, estimate
+from posekit.estimate.estimator import Estimators
+from posekit.synth.example import locomotive
+from posekit.synth.tabletop import TabletopConfig, compose, procedural_objects
+from posekit.visualise import draw, figures
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else "posekit-out/several_objects")
 out.mkdir(parents=True, exist_ok=True)

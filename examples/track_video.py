@@ -4,10 +4,11 @@ import json
 import sys
 from pathlib import Path
 
-from posekit import Renderer, estimate, figures
-from posekit.data.example import make_film
-from posekit.track import Tracker
-from posekit.video import VideoWriter, open_frames
+from posekit import Renderer, estimate
+from posekit.io.video import VideoWriter, open_frames
+from posekit.synth.example import make_film
+from posekit.tracking.tracker import Tracker
+from posekit.visualise import figures
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else "posekit-out/track_video")
 out.mkdir(parents=True, exist_ok=True)

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from posekit import Renderer, estimate
-from posekit.data.example import make_example, ply
+from posekit.synth.example import make_example, ply
 from posekit.train.config import SourceConfig, changed, default_config
 from posekit.train.pose import train_pose
 

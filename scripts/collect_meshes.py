@@ -19,7 +19,7 @@ import numpy as np
 from rich.progress import track
 
 from posekit.errors import PosekitError
-from posekit.object_model import ObjectModel
+from posekit.mesh.model import ObjectModel
 
 ALLOWED = re.compile(r"public domain|CC[- ]?0|CC[- ]?BY(?!-?(NC|ND|SA))|Creative Commons Attribution(?! ?-)", re.I)
 CATALOGUE = "PluginFurnitureCatalog.properties"

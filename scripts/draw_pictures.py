@@ -9,11 +9,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from posekit import PoseEstimator, Renderer, draw, estimate, figures
-from posekit.data.example import locomotive, make_example, make_film
-from posekit.draw import Image
+from posekit import PoseEstimator, Renderer, estimate
 from posekit.render import render_views, view_rotations
-from posekit.track import Tracker
+from posekit.synth.example import locomotive, make_example, make_film
+from posekit.tracking.tracker import Tracker
+from posekit.visualise import draw, figures
+from posekit.visualise.draw import Image
 
 MOST_BYTES = 200_000
 TILE = (320, 240)

@@ -10,10 +10,10 @@ from PIL import Image
 
 from objects import bracket, cuboid
 from posekit.camera import Camera
-from posekit.data.example import ply
 from posekit.geometry import Pose, random_rotation
-from posekit.object_model import ObjectModel
+from posekit.mesh.model import ObjectModel
 from posekit.render import Renderer
+from posekit.synth.example import ply
 
 CAMERA = Camera(200.0, 201.0, 79.0, 61.0, 160, 120)
 

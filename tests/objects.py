@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from posekit.object_model import ObjectModel
+from posekit.mesh.model import ObjectModel
 
 
 def cuboid(low: tuple[float, float, float], high: tuple[float, float, float], cells: int = 1):  # type: ignore[no-untyped-def]

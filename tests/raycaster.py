@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from posekit.camera import Camera
 from posekit.geometry import Pose
-from posekit.object_model import ObjectModel
+from posekit.mesh.model import ObjectModel
 
 Array = NDArray[np.float64]
 

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from posekit import Camera, EstimateOptions, PoseEstimator, Result, api, estimate
-from posekit.data.example import Example, make_example, ply
 from posekit.errors import ImageError, PromptError
 from posekit.nets.weights import build, save_networks
 from posekit.render import Renderer
+from posekit.synth.example import Example, make_example, ply
 
 CAMERA = "610,610,322,236"
 

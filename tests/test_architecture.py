@@ -14,65 +14,39 @@ SOURCE = Path(__file__).resolve().parent.parent / "src" / "posekit"
 # A room (a module of the top level, or a package) and its layer. Imports go down only.
 # Rooms that are planned stand here too; a room that is built must stand here.
 LAYERS = {
-    0: {"geometry", "camera", "files", "lens", "polygons", "pixels", "mesh_files", "gltf_files", "limits"},
-    1: {"view", "object_model", "results", "pose_formats"},
-    2: {"load", "calibration", "zoom", "metrics", "pnp", "fusion", "render", "nets", "detect", "draw", "evidence"},
-    3: {
-        "data",
-        "refine",
-        "hypotheses",
-        "figures",
-        "odometry",
-        "video",
-        "contour",
-        "region",
-        "recording",
-        "view_bank",
-        "mvnet_search",
-        "features",
-    },
-    4: {"estimate", "novel"},
-    5: {"search", "track", "evaluate", "train"},
-    6: {"api"},
-    7: {"cli"},
-    8: {"__main__"},
+    0: {"geometry", "camera", "lens"},
+    1: {"view", "results"},
+    2: {"io", "metrics"},
+    3: {"mesh"},
+    4: {"zoom", "render", "nets", "object_model"},
+    5: {"align", "visualise"},
+    6: {"detect", "first_pose"},
+    7: {"estimate", "datasets"},
+    8: {"tracking", "synth"},
+    9: {"evaluate", "train", "api"},
+    10: {"cli"},
+    11: {"__main__"},
 }
 ANYWHERE = {"errors", "_version"}
-# Fusion weighs what PnP alone solves. A camera turns rays; tracking and the search for instances are measured too.
-SIBLINGS = {
-    ("camera", "geometry"),
-    ("fusion", "pnp"),
-    ("evaluate", "track"),
-    ("evaluate", "search"),
-    ("track", "search"),
-}
-SIBLINGS |= {
-    ("mesh_files", "polygons"),
-    ("mesh_files", "gltf_files"),
-    ("gltf_files", "pixels"),
-    ("gltf_files", "limits"),
-    ("lens", "camera"),
-    ("load", "calibration"),
-}  # a lens belongs to a camera, a photograph to a calibration
-SIBLINGS |= {("odometry", "region"), ("refine", "region")}  # a look keeps its outline, refinement weighs it
-# MV-Net is trained and used with the same views; its search is one of several that give first poses.
-SIBLINGS |= {("data", "view_bank"), ("mvnet_search", "view_bank"), ("mvnet_search", "hypotheses")}
+# A camera turns rays, a lens belongs to a camera; the detector of objects that were never trained on compares them with
+# the views that first poses come from.
+SIBLINGS = {("camera", "geometry"), ("lens", "camera"), ("detect", "first_pose")}
 
 # A foreign library and the rooms whose door it is.
 DOORS = {
     "moderngl": {"render"},
     "glcontext": {"render"},
-    "trimesh": {"object_model"},
-    "mapbox_earcut": {"polygons"},
-    "yaml": {"calibration"},
+    "trimesh": {"mesh"},
+    "mapbox_earcut": {"mesh"},
+    "yaml": {"io"},
     "torchvision": {"detect", "train"},
     "lightning_fabric": {"train"},
     "typer": {"cli"},
     "rich": {"cli"},
-    "huggingface_hub": {"data"},
+    "huggingface_hub": {"datasets"},
     "pycocotools": {"detect"},
-    "av": {"video"},
-    "rerun": {"recording"},
+    "av": {"io"},
+    "rerun": {"visualise"},
     "openvino": {"nets", "cli"},
 }
 

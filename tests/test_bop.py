@@ -16,7 +16,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from posekit.data.bop import BopDataset
+from posekit.datasets.bop import BopDataset
 from posekit.errors import CameraError, ImageError, InputError, MeshError, PromptError
 from posekit.geometry import random_rotation
 

@@ -11,11 +11,12 @@ import pytest
 
 from objects import bracket
 from posekit.camera import Camera
-from posekit.data.bop import BopDataset
-from posekit.data.bop_writer import Annotation, BopWriter, Picture, mask_to_rle, model_info, write_models
+from posekit.datasets.bop import BopDataset
+from posekit.datasets.bop_writer import Annotation, BopWriter, Picture, mask_to_rle, model_info, write_models
 from posekit.errors import InputError
 from posekit.geometry import Pose, random_rotation
-from posekit.object_model import ObjectModel, Symmetries
+from posekit.mesh.model import ObjectModel
+from posekit.mesh.symmetries import Symmetries
 
 CAMERA = Camera(100.0, 101.0, 31.5, 23.5, 64, 48)
 RNG = np.random.default_rng(0)

@@ -25,12 +25,12 @@ import numpy as np
 import pytest
 
 from objects import bracket
-from posekit.calibration import load_calibration
 from posekit.camera import Camera
 from posekit.cli.prompts import prompt_for
 from posekit.errors import CameraError
+from posekit.io.calibration import load_calibration
+from posekit.io.load import load_camera, load_view
 from posekit.lens import Lens
-from posekit.load import load_camera, load_view
 from posekit.view import View
 
 FX, FY, CX, CY = 572.4, 573.5, 325.2, 242.0

@@ -26,11 +26,11 @@ from posekit.camera import Camera
 from posekit.cli import doctor
 from posekit.cli.app import app
 from posekit.cli.output import limits
-from posekit.data.example import Example, make_example, ply
 from posekit.geometry import Pose, rotation_angle
-from posekit.load import load_pose
+from posekit.io.load import load_pose
 from posekit.nets.weights import build, save_networks
 from posekit.render import Renderer
+from posekit.synth.example import Example, make_example, ply
 
 Invoke = Callable[..., Result]
 
@@ -550,7 +550,7 @@ def test_what_nobody_foresaw_has_one_exit(error: Exception, invoke: Invoke, monk
     def fail(*_: object, **__: object) -> None:
         raise error
 
-    monkeypatch.setattr("posekit.load.load_image", fail)
+    monkeypatch.setattr("posekit.io.load.load_image", fail)
     assert_fails(invoke("estimate"), "something unexpected", type(error).__name__, "please report it", "--debug")
 
 

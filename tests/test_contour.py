@@ -8,11 +8,11 @@ import pytest
 from numpy.typing import NDArray
 
 from objects import bracket
+from posekit.align.mask_edge import fit_contour
 from posekit.camera import Camera
-from posekit.contour import fit_contour
+from posekit.estimate.refine import pose_change
 from posekit.geometry import Pose, PoseNoise, random_rotation
-from posekit.object_model import ObjectModel
-from posekit.refine import pose_change
+from posekit.mesh.model import ObjectModel
 from posekit.render import Renderer
 from posekit.view import View
 

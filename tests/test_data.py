@@ -11,15 +11,15 @@ import pytest
 import torch
 
 from objects import bracket
-from posekit.data.appearance import KINDS, faded, variants
-from posekit.data.augment import AugmentConfig, augment, composed, disturb_mask, observe
-from posekit.data.pairs import Pair, PairConfig, render_pairs, stack_statistics
-from posekit.data.procedural import random_object, random_texture
-from posekit.data.scenes import Frontal, SceneConfig, box_sample, render_scenes
-from posekit.data.stream import PairStream, StreamConfig, load_photos
 from posekit.geometry import quat_to_rotation, rotation_angle
 from posekit.nets.pose_delta import apply_delta
 from posekit.render import Light, Renderer
+from posekit.synth.appearance import KINDS, faded, variants
+from posekit.synth.procedural import random_object, random_texture
+from posekit.train.data.augment import AugmentConfig, augment, composed, disturb_mask, observe
+from posekit.train.data.crops import Frontal, SceneConfig, box_sample, render_scenes
+from posekit.train.data.pairs import Pair, PairConfig, render_pairs, stack_statistics
+from posekit.train.data.stream import PairStream, StreamConfig, load_photos
 from posekit.zoom import frontal_pose
 
 
@@ -30,7 +30,9 @@ def pairs() -> list[Pair]:
 
 def test_the_flow_leads_to_the_same_paint(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the flow says that a seen anchor goes, the target shows the colour that the source shows."""
-    monkeypatch.setattr("posekit.data.pairs.random_light", lambda rng: Light(ambient=0.9, diffuse=0.1, specular=0.0))
+    monkeypatch.setattr(
+        "posekit.train.data.pairs.random_light", lambda rng: Light(ambient=0.9, diffuse=0.1, specular=0.0)
+    )
     hues = []
     for pair in render_pairs(Renderer(), bracket(), 30, PairConfig(unlike=0, deformed=0), np.random.default_rng(0)):
         if pair.lost:

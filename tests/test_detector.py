@@ -20,8 +20,6 @@ from typer.testing import CliRunner
 from objects import bracket
 from posekit.camera import Camera, mask_box
 from posekit.cli.app import app
-from posekit.data.tabletop import TabletopConfig, procedural_objects
-from posekit.data.tabletop_stream import TabletopStream, TabletopStreamConfig, labelled_scenes
 from posekit.detect import maskrcnn
 from posekit.detect.coco import Truth, average_precision
 from posekit.detect.external import DetectionsFile, categories_of, to_bop, to_coco
@@ -36,18 +34,20 @@ from posekit.detect.maskrcnn import (
     load_detector,
     save_detector,
 )
+from posekit.detect.novel import LikenedDetector, NovelDetector
 from posekit.detect.segmentation import decode, encode
 from posekit.detect.vision import nms, roi_align, torchvision
-from posekit.draw import png
 from posekit.errors import ConfigError, PromptError, WeightsError
 from posekit.geometry import Pose, random_rotation, view_rotation
-from posekit.novel import LikenedDetector, NovelDetector
-from posekit.object_model import ObjectModel
+from posekit.mesh.model import ObjectModel
 from posekit.render import Renderer
 from posekit.results import Detection, Source
+from posekit.synth.tabletop import TabletopConfig, procedural_objects
 from posekit.train.config import MachineConfig, OptimiserConfig, SourceConfig, write_config
+from posekit.train.data.tabletop_stream import TabletopStream, TabletopStreamConfig, labelled_scenes
 from posekit.train.detector import DetectorConfig, DetectorModule, read_config, target, train_detector
 from posekit.view import View
+from posekit.visualise.draw import png
 
 TINY = MaskRCNNConfig(size=(128, 96), use_size=(128, 96), channels=16, hidden=32, proposals=(20, 20), samples=16)
 SCENES = TabletopStreamConfig(

@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
-from posekit.data.datasets import DatasetInfo, dataset_info
-from posekit.data.download import download
+from posekit.datasets.download import download
+from posekit.datasets.registry import DatasetInfo, dataset_info
 from posekit.errors import InputError
 
 INFO = DatasetInfo("toy", "Toy", (1,), archives=("toy_base.zip", "toy_models.zip"))

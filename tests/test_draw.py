@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from posekit import draw
 from posekit.camera import Camera
-from posekit.draw import WHITE
 from posekit.geometry import Pose
+from posekit.visualise import draw
+from posekit.visualise.draw import WHITE
 
 CAMERA = Camera(500.0, 500.0, 79.5, 59.5, 160, 120)
 

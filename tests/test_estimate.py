@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from posekit.camera import Camera
-from posekit.data.example import make_example
-from posekit.data.tabletop import procedural_objects
 from posekit.errors import ConfigError, WeightsError
-from posekit.estimate import EstimateOptions, PoseEstimator, presence, score
+from posekit.estimate.estimator import EstimateOptions, PoseEstimator, presence, score
+from posekit.estimate.refine import pose_change
+from posekit.first_pose.hypotheses import poses_beside
 from posekit.geometry import Pose, PoseNoise
-from posekit.hypotheses import poses_beside
 from posekit.metrics import pose_error
 from posekit.nets.weights import build, save_networks
-from posekit.refine import pose_change
 from posekit.render import Renderer
 from posekit.results import Detection, Source
+from posekit.synth.example import make_example
+from posekit.synth.tabletop import procedural_objects
 from posekit.view import View
 
 

@@ -12,16 +12,17 @@ import torch
 from bop_scene import brick
 from objects import bracket
 from posekit.camera import Camera
-from posekit.estimate import EstimateOptions, PoseEstimator
+from posekit.estimate.estimator import EstimateOptions, PoseEstimator
+from posekit.first_pose.hypotheses import BoxSearch, TemplateSearch
 from posekit.geometry import Pose, rotation_angle, so3_exp, view_rotation
-from posekit.hypotheses import BoxSearch, TemplateSearch
+from posekit.mesh.model import ObjectModel
+from posekit.mesh.symmetries import Symmetries
 from posekit.metrics import pose_error
 from posekit.nets.paper import PaperSVNet
 from posekit.nets.weights import Networks, PaperConfig, build, save_networks
-from posekit.object_model import ObjectModel, Symmetries
 from posekit.render import Renderer
 from posekit.results import Branch, Detection, Estimate, Source
-from posekit.track import LOST, RESTARTED, Tracker
+from posekit.tracking.tracker import LOST, RESTARTED, Tracker
 from posekit.view import View
 from test_refine import Oracle
 

@@ -25,16 +25,16 @@ from typer.testing import CliRunner, Result
 
 from bop_scene import CAMERA, put, write_scene
 from posekit.cli.app import app
-from posekit.data.bop import BopDataset
+from posekit.datasets.bop import BopDataset
+from posekit.datasets.results_csv import COLUMNS, ResultRow, csv_name, read_detections, read_results, results_csv
 from posekit.errors import InputError, OutputError
-from posekit.estimate import EstimateOptions
+from posekit.estimate.estimator import EstimateOptions
 from posekit.evaluate import EvalOptions, compare, evaluate
-from posekit.evaluate.bop_results import COLUMNS, ResultRow, csv_name, read_detections, read_results, results_csv
 from posekit.evaluate.stages import ImageStage, detections_for
 from posekit.evaluate.table import novelty
 from posekit.evaluate.truths import TruthReader
 from posekit.geometry import Pose, so3_exp
-from posekit.object_model import ObjectModel
+from posekit.mesh.model import ObjectModel
 from posekit.results import Detection
 from posekit.view import View
 
@@ -578,10 +578,10 @@ def test_the_interval_covers_a_known_difference(tmp_path: Path) -> None:
 
 
 def test_a_tile_shows_truth_and_estimate_side_by_side() -> None:
-    from posekit import draw
-    from posekit.data.example import make_example
     from posekit.evaluate.report import tile
     from posekit.render import Renderer
+    from posekit.synth.example import make_example
+    from posekit.visualise import draw
 
     renderer = Renderer()
     example = make_example(renderer)

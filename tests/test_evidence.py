@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from posekit.evidence import CLEAR, Palette, Picture, Silhouettes, Weights, separation
+from posekit.first_pose.evidence import CLEAR, Palette, Picture, Silhouettes, Weights, separation
 
 SIDE = 48
 

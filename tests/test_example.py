@@ -9,14 +9,14 @@ import cv2
 import numpy as np
 import pytest
 
-from posekit import draw, figures
 from posekit.camera import Camera, mask_box
-from posekit.data.example import Example, locomotive, make_example, ply
 from posekit.geometry import Pose
-from posekit.object_model import ObjectModel
+from posekit.mesh.model import ObjectModel
 from posekit.render import Renderer
 from posekit.results import Detection, Estimate, Source, Step
+from posekit.synth.example import Example, locomotive, make_example, ply
 from posekit.view import View
+from posekit.visualise import draw, figures
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ import cv2
 import pytest
 import torch
 
-from posekit.video import open_frames
+from posekit.io.video import open_frames
 
 ROOT = Path(__file__).resolve().parent.parent
 EXAMPLES = ROOT / "examples"

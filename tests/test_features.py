@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from objects import bracket, cuboid
-from posekit import features
 from posekit.camera import Camera
-from posekit.features import FeatureModel, FeatureSearch, cache_file
+from posekit.detect.novel import make_detector
+from posekit.first_pose import features
+from posekit.first_pose.features import FeatureModel, FeatureSearch, cache_file
 from posekit.geometry import Pose, random_rotation, rotation_angle
-from posekit.novel import make_detector
-from posekit.object_model import ObjectModel
+from posekit.mesh.model import ObjectModel
 from posekit.render import Light, Renderer
 from posekit.view import View
 

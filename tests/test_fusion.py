@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from conftest import differences, moved
+from posekit.align.fusion import Belief, Lines, Points, fuse
+from posekit.align.mask_edge import ContourConfig, _equations, _Look
 from posekit.camera import Camera
-from posekit.contour import ContourConfig, _equations, _Look
-from posekit.fusion import Belief, Lines, Points, fuse
 from posekit.geometry import Pose, so3_exp, so3_log
 from posekit.nets.rigid import Motion, Surface, _step, exp_so3, induced_flow
 

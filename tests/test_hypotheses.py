@@ -11,12 +11,12 @@ import torch
 from objects import bracket
 from posekit.camera import Camera, mask_box
 from posekit.errors import WeightsError
+from posekit.estimate.refine import crops
+from posekit.first_pose.hypotheses import BoxSearch, Judge, MVNetSearch, TemplateSearch, agreement_of
 from posekit.geometry import Pose, random_rotation, rotation_angle, so3_exp
-from posekit.hypotheses import BoxSearch, Judge, MVNetSearch, TemplateSearch, agreement_of
 from posekit.nets.heads import Prediction
 from posekit.nets.pose_delta import delta_between
 from posekit.nets.weights import PaperConfig, build
-from posekit.refine import crops
 from posekit.render import Light, Renderer
 from posekit.results import Detection, Source
 from posekit.view import View

@@ -10,12 +10,12 @@ from PIL import Image
 
 from bop_scene import bop_pose, brick, put
 from objects import bracket
-from posekit.data.datasets import DATASETS, data_folder, dataset_info, find_root, open_dataset
-from posekit.data.example import ply
-from posekit.data.linemod import DeepimDataset, LinemodDataset, spread_rotations
+from posekit.datasets.linemod import DeepimDataset, LinemodDataset, spread_rotations
+from posekit.datasets.registry import DATASETS, data_folder, dataset_info, find_root, open_dataset
 from posekit.errors import ConfigError, InputError
 from posekit.evaluate.table import PUBLISHED, paper_table
 from posekit.geometry import Pose, rotation_angle, so3_exp
+from posekit.synth.example import ply
 
 ANGLES = (0, 4, 16, 20, 33, 50)  # degrees about z; 0, 16, 33 and 50 are 15 degrees apart
 

@@ -8,7 +8,7 @@ import pytest
 from posekit import metrics
 from posekit.camera import Camera
 from posekit.geometry import Pose, random_rotation, so3_exp
-from posekit.object_model import Symmetries
+from posekit.mesh.symmetries import Symmetries
 
 GT = Pose(random_rotation(np.random.default_rng(5)), [0.1, -0.05, 0.8])
 POINTS = np.random.default_rng(1).uniform(-0.05, 0.05, size=(200, 3))

@@ -12,8 +12,16 @@ from torch import Tensor, nn
 
 from objects import bracket
 from posekit.camera import Camera, mask_box
-from posekit.data.procedural import random_object
-from posekit.data.view_queries import (
+from posekit.first_pose.mvnet import Answer, MatchingSearch
+from posekit.first_pose.view_bank import DISTANCE, ViewBank
+from posekit.geometry import Pose, fibonacci_sphere, random_rotation, rotation_angle, rotation_between
+from posekit.mesh.model import ObjectModel
+from posekit.nets.mvnet import CELL, GRID, NONE, MatchingMVNet, MVOutput, rgb_input, view_input
+from posekit.nets.mvnet_loss import MVLossConfig, mvnet_loss
+from posekit.render import Renderer
+from posekit.results import Detection
+from posekit.synth.procedural import random_object
+from posekit.train.data.view_queries import (
     QueryConfig,
     QueryGroup,
     QueryScene,
@@ -23,15 +31,7 @@ from posekit.data.view_queries import (
     match_targets,
     render_queries,
 )
-from posekit.geometry import Pose, fibonacci_sphere, random_rotation, rotation_angle, rotation_between
-from posekit.mvnet_search import Answer, MatchingSearch
-from posekit.nets.mvnet import CELL, GRID, NONE, MatchingMVNet, MVOutput, rgb_input, view_input
-from posekit.nets.mvnet_loss import MVLossConfig, mvnet_loss
-from posekit.object_model import ObjectModel
-from posekit.render import Renderer
-from posekit.results import Detection
 from posekit.view import View
-from posekit.view_bank import DISTANCE, ViewBank
 
 QUERIES = QueryConfig(queries=2, templates=8, kept=4, views=12, absent=0.0)
 

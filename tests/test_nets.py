@@ -21,16 +21,7 @@ from posekit.errors import ConfigError, WeightsError
 from posekit.nets.flownet import LAYERS, FlowNetEncoder
 from posekit.nets.heads import PoseHeads, Prediction, compress_angle, expand_angle
 from posekit.nets.inputs import images_to_tensor, relief, to_input
-from posekit.nets.lite import (
-    LiteConfig,
-    LiteSVNet,
-    attention,
-    likeness_of,
-    normals_of,
-    soft_flow,
-    warp,
-    with_none,
-)
+from posekit.nets.lite import LiteConfig, LiteSVNet, attention, likeness_of, normals_of, soft_flow, warp, with_none
 from posekit.nets.losses import Target, dense_loss, matching_loss, mvnet_loss, svnet_loss, true_score
 from posekit.nets.paper import Branch, PaperMVNet, PaperSVNet
 from posekit.nets.precision import choose_device

@@ -26,7 +26,9 @@ from objects import cuboid
 from posekit.camera import Camera
 from posekit.errors import MeshError
 from posekit.geometry import Pose, cube_views, random_rotation, rotation_angle, so3_exp
-from posekit.object_model import ObjectModel, Symmetries, smooth_normals
+from posekit.mesh.model import ObjectModel
+from posekit.mesh.processing import smooth_normals
+from posekit.mesh.symmetries import Symmetries
 from posekit.render import Renderer
 
 BOX = trimesh.creation.box((0.10, 0.06, 0.04))

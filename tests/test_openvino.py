@@ -11,12 +11,12 @@ import torch
 from objects import bracket
 from posekit.camera import Camera
 from posekit.errors import ConfigError
+from posekit.estimate.refine import compare, update_pose
 from posekit.geometry import Pose, so3_exp, view_rotation
 from posekit.nets.openvino import OpenVinoPredictor
 from posekit.nets.predictor import NetworkPredictor
 from posekit.nets.rigid import solved
 from posekit.nets.weights import build, load_networks
-from posekit.refine import compare, update_pose
 from posekit.render import Renderer
 from posekit.view import View
 

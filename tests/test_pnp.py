@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from conftest import differences, moved
+from posekit.align.pnp import PnpConfig, projection_jacobian, solve_pnp
 from posekit.camera import Camera
 from posekit.geometry import Pose, rotation_angle, so3_exp
-from posekit.pnp import PnpConfig, projection_jacobian, solve_pnp
 
 CAMERA = Camera(900.0, 870.0, 81.5, 57.5, 160, 120)
 

@@ -12,8 +12,8 @@ import yaml
 
 from posekit.errors import ConfigError, PromptError
 from posekit.geometry import Pose, quat_to_rotation, random_rotation
-from posekit.load import load_pose
-from posekit.pose_formats import FORMATS, UNITY_MESH, NamedPose, pose_files, pose_from_text, to_blender, to_unity
+from posekit.io.load import load_pose
+from posekit.io.pose_formats import FORMATS, UNITY_MESH, NamedPose, pose_files, pose_from_text, to_blender, to_unity
 
 RNG = np.random.default_rng(4)
 POSE = Pose(random_rotation(RNG), [0.1, -0.2, 0.9])

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from objects import bracket
+from posekit.align.pnp import solve_pnp
 from posekit.camera import Camera
 from posekit.errors import ConfigError
+from posekit.estimate.refine import Refinement, RefineOptions, refine
 from posekit.geometry import Pose, PoseNoise, rotation_angle, rotation_between, so3_exp, view_rotation
+from posekit.mesh.model import ObjectModel
 from posekit.nets.pose_delta import PoseDelta, apply_delta, delta_between
 from posekit.nets.predictor import Correspondences, PairPrediction
-from posekit.object_model import ObjectModel
-from posekit.pnp import solve_pnp
-from posekit.refine import Refinement, RefineOptions, refine
 from posekit.render import Renderer
 from posekit.results import Step
 from posekit.view import View

@@ -17,7 +17,7 @@ import posekit
 from posekit.camera import Camera, mask_box
 from posekit.errors import RenderError
 from posekit.geometry import Pose, random_rotation, so3_exp
-from posekit.object_model import ObjectModel
+from posekit.mesh.model import ObjectModel
 from posekit.render import Light, Renderer, context, info, render_views, view_rotations
 from raycaster import cast
 
@@ -409,7 +409,7 @@ def test_each_backend_draws_the_same(backend, renderer, tmp_path) -> None:
 import numpy as np
 from posekit.camera import Camera
 from posekit.geometry import Pose
-from posekit.object_model import ObjectModel
+from posekit.mesh.model import ObjectModel
 from posekit.render import Renderer, info
 v = np.array({(UNIT_SQUARE * 0.1).tolist()})
 model = ObjectModel.from_arrays(v, np.array({SQUARE_FACES.tolist()}))

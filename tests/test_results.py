@@ -13,9 +13,9 @@ import pytest
 
 from posekit import __version__
 from posekit.errors import OutputError, PromptError
-from posekit.files import write_bytes_atomic, write_text_atomic
 from posekit.geometry import Pose, random_rotation
-from posekit.load import load_pose
+from posekit.io.files import write_bytes_atomic, write_text_atomic
+from posekit.io.load import load_pose
 from posekit.results import (
     RELIABLE_ANGLE_DEG,
     RELIABLE_SCORE,

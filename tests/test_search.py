@@ -16,18 +16,18 @@ from bop_scene import CAMERA, brick, put, write_scene
 from objects import bracket
 from posekit.camera import Camera, box_overlap
 from posekit.cli.app import app
-from posekit.data.bop import BopDataset
+from posekit.datasets.bop import BopDataset
 from posekit.detect.segmentation import encode, xywh
-from posekit.estimate import EstimateOptions, Estimators
+from posekit.estimate.estimator import EstimateOptions, Estimators
+from posekit.estimate.instances import SearchOptions, estimates_of, find_instances, judged
 from posekit.evaluate import EvalOptions
 from posekit.evaluate.stages import ImageStage
 from posekit.evaluate.truths import Truth, TruthReader
 from posekit.geometry import Pose
+from posekit.mesh.model import ObjectModel
 from posekit.nets.weights import build, save_networks
-from posekit.object_model import ObjectModel
 from posekit.results import Detection, Estimate, Source
-from posekit.search import SearchOptions, estimates_of, find_instances, judged
-from posekit.track import LOST, RESTARTED, Tracker
+from posekit.tracking.tracker import LOST, RESTARTED, Tracker
 from posekit.view import View
 from test_refine import Oracle
 
@@ -113,7 +113,7 @@ def file(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_command_and_the_evaluation_find_the_same_poses(
     kind: str, root: Path, weights: Path, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for place in ("posekit.novel.make_detector", "posekit.evaluate.stages.make_detector"):
+    for place in ("posekit.detect.novel.make_detector", "posekit.evaluate.stages.make_detector"):
         monkeypatch.setattr(place, lambda *_, **__: (Oracles(root), ()))
     found = measured(root, weights, str(file) if kind == "file" else kind)
     for truth in truths(root):

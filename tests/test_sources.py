@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from objects import bracket
-from posekit.data.example import ply
 from posekit.errors import MeshError
-from posekit.object_model import ObjectModel
+from posekit.mesh.model import ObjectModel
+from posekit.synth.example import ply
 from posekit.train.config import SourceConfig
 from posekit.train.sources import read_sources
 

@@ -21,17 +21,17 @@ from typer.testing import CliRunner
 
 from objects import bracket, cuboid
 from posekit.cli.app import app
-from posekit.data.bop import BopDataset
-from posekit.data.bop_writer import write_models
-from posekit.data.symmetry import detect_symmetries
-from posekit.data.synth.backdrops import Backdrops
-from posekit.data.synth.plan import SynthConfig
-from posekit.data.synth.run import Machines, begin, run
+from posekit.datasets.bop import BopDataset
+from posekit.datasets.bop_writer import write_models
+from posekit.datasets.results_csv import ResultRow, results_csv
+from posekit.datasets.symmetry import detect_symmetries
 from posekit.errors import ConfigError, InputError, OutputError
-from posekit.evaluate.bop_results import ResultRow, results_csv
+from posekit.mesh.model import ObjectModel
 from posekit.metrics import pose_error
-from posekit.object_model import ObjectModel
 from posekit.render import Renderer
+from posekit.synth.backdrops import Backdrops
+from posekit.synth.plan import SynthConfig
+from posekit.synth.run import Machines, begin, run
 
 SIZE = (160, 120)
 QUIET = lambda done, total: None  # noqa: E731
@@ -130,7 +130,7 @@ def test_killed_and_resumed_is_never_killed(tmp_path: Path) -> None:
     make(tmp_path / "whole", what)
     root = tmp_path / "killed"
     begin(what, root, objects())
-    code = "import sys; from pathlib import Path; from posekit.data.synth.run import Machines, run\n" \
+    code = "import sys; from pathlib import Path; from posekit.synth.run import Machines, run\n" \
            "run(Path(sys.argv[1]), Machines(), lambda done, total: None)"  # fmt: skip
     for wanted in (3, 17):
         process = subprocess.Popen([sys.executable, "-c", code, str(root)], start_new_session=True)
@@ -315,7 +315,7 @@ def test_settings_that_make_no_sense(tmp_path: Path) -> None:
 
 def test_rooms_are_traced_where_masks_are(tmp_path: Path, renderer: Renderer) -> None:
     """Mitsuba and posekit's renderer see the same surfaces at the same depth; the same seed gives the same pixels."""
-    from posekit.data.synth.photoreal import Photoreal
+    from posekit.synth.photoreal import Photoreal
 
     what = config("photoreal", 2, size=(64, 48), samples=2, views=2, variant="scalar_rgb")
     data = make(tmp_path / "set", what)
@@ -361,7 +361,7 @@ def test_environments_from_files_light_the_rooms(tmp_path: Path) -> None:
 
 
 def test_what_photoreal_needs_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    from posekit.data.synth import photoreal
+    from posekit.synth import photoreal
 
     with pytest.raises(ConfigError, match=r"--variant nothing: this Mitsuba has .*scalar_rgb"):
         photoreal.load_mitsuba("nothing")
@@ -377,7 +377,7 @@ def test_what_photoreal_needs_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_things_dropped_come_to_rest() -> None:
-    from posekit.data.synth.photoreal import drop
+    from posekit.synth.photoreal import drop
 
     models = [bracket(), *objects().values()]
     poses = drop(models, np.random.default_rng(1), 0.1)

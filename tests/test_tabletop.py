@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from objects import bracket
-from posekit.data.tabletop import DISTRACTOR, TabletopConfig, compose, procedural_objects, resting_rotation
 from posekit.errors import ConfigError
 from posekit.render import Renderer
+from posekit.synth.tabletop import DISTRACTOR, TabletopConfig, compose, procedural_objects, resting_rotation
 
 CONFIG = TabletopConfig(size=(160, 120), objects=(3, 5), distractors=(2, 3))
 

@@ -18,23 +18,23 @@ from typer.testing import CliRunner
 
 from bop_scene import write_scene
 from objects import bracket, cuboid
+from posekit.align.colour_edge import Tint, learn, off_colour, outline_lines
+from posekit.align.fusion import Belief, Points, fuse
 from posekit.camera import Camera
 from posekit.cli.app import app
-from posekit.data.example import Example, make_example, ply
 from posekit.errors import CameraError, ConfigError, OutputError
-from posekit.fusion import Belief, Points, fuse
+from posekit.estimate.refine import crops
 from posekit.geometry import Pose, rotation_angle, so3_exp, view_rotation
+from posekit.io.video import VideoFrames, VideoWriter
+from posekit.mesh.model import ObjectModel
 from posekit.metrics import pose_error
-from posekit.object_model import ObjectModel
-from posekit.odometry import Look, follow_points, match_texture
-from posekit.recording import Recorder
-from posekit.refine import crops
-from posekit.region import Tint, learn, off_colour, outline_lines
 from posekit.render import Renderer
 from posekit.results import Detection, Estimate
-from posekit.track import LOST, RESTARTED, TRACKED, TrackConfig, Tracker
-from posekit.video import VideoFrames, VideoWriter
+from posekit.synth.example import Example, make_example, ply
+from posekit.tracking.points import Look, follow_points, match_texture
+from posekit.tracking.tracker import LOST, RESTARTED, TRACKED, TrackConfig, Tracker
 from posekit.view import View
+from posekit.visualise.recording import Recorder
 from test_refine import Oracle
 
 CAMERA = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)

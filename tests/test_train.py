@@ -30,19 +30,15 @@ from typer.testing import CliRunner
 from objects import bracket
 from posekit.camera import Camera
 from posekit.cli.app import app
-from posekit.data.augment import AugmentConfig
-from posekit.data.bop import BopDataset
-from posekit.data.scenes import SceneConfig
-from posekit.data.stream import PairStream, StreamConfig
-from posekit.data.view_queries import QueryConfig
+from posekit.datasets.bop import BopDataset
 from posekit.errors import ConfigError, OutputError, TrainingError, WeightsError
 from posekit.geometry import Pose, random_rotation
+from posekit.mesh.model import ObjectModel
 from posekit.nets.flownet import LAYERS
 from posekit.nets.heads import compress_angle
 from posekit.nets.lite import LiteConfig, LiteSVNet
 from posekit.nets.paper import PaperSVNet
 from posekit.nets.weights import build, load_networks, save_networks
-from posekit.object_model import ObjectModel
 from posekit.render import Renderer
 from posekit.train.calibrate import fit_median, passed_poses
 from posekit.train.checkpoint import Checkpoint, Checkpoints
@@ -55,6 +51,10 @@ from posekit.train.config import (
     read_config,
     write_config,
 )
+from posekit.train.data.augment import AugmentConfig
+from posekit.train.data.crops import SceneConfig
+from posekit.train.data.stream import PairStream, StreamConfig
+from posekit.train.data.view_queries import QueryConfig
 from posekit.train.loop import Trainer, make_fabric, rate_at
 from posekit.train.measure import CaseSource, rendered_cases
 from posekit.train.paper import PaperTask

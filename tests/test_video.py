@@ -24,7 +24,7 @@ import PIL.Image
 import pytest
 
 from posekit.errors import ImageError, InputError
-from posekit.video import Frame, ReadAhead, VideoFrames, VideoWriter, open_frames
+from posekit.io.video import Frame, ReadAhead, VideoFrames, VideoWriter, open_frames
 
 SIZE = (96, 64)
 

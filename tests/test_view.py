@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from objects import bracket
+from posekit.align.colour_edge import learn, outline_lines
 from posekit.camera import Camera, Zoom
+from posekit.estimate.refine import crops
 from posekit.geometry import Pose, view_rotation
-from posekit.load import load_view
-from posekit.odometry import Look, follow_points
-from posekit.refine import crops
-from posekit.region import learn, outline_lines
+from posekit.io.load import load_view
+from posekit.io.video import open_frames
 from posekit.render import Renderer
-from posekit.video import open_frames
+from posekit.tracking.points import Look, follow_points
 from posekit.view import View
 
 CAMERA = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)

@@ -23,7 +23,7 @@ import pytest
 from PIL import Image
 
 from posekit.errors import CameraError, ConfigError, ImageError, PromptError
-from posekit.load import camera_from_exif, load_camera, load_image, load_mask, load_pose, load_view, parse_box
+from posekit.io.load import camera_from_exif, load_camera, load_image, load_mask, load_pose, load_view, parse_box
 
 PIXELS = np.random.default_rng(0).integers(0, 256, size=(48, 64, 3), dtype=np.uint8)
 SIZE = (64, 48)

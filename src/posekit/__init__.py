@@ -14,9 +14,9 @@ from posekit.errors import PosekitError
 if TYPE_CHECKING:
     from posekit.api import Result, estimate
     from posekit.camera import Camera
-    from posekit.estimate import EstimateOptions, PoseEstimator
+    from posekit.estimate.estimator import EstimateOptions, PoseEstimator
     from posekit.geometry import Pose
-    from posekit.object_model import ObjectModel
+    from posekit.mesh.model import ObjectModel
     from posekit.render import Renderer
     from posekit.results import Detection, Estimate
     from posekit.view import View
@@ -25,10 +25,10 @@ _HOMES = {
     "Camera": "camera",
     "Detection": "results",
     "Estimate": "results",
-    "EstimateOptions": "estimate",
-    "ObjectModel": "object_model",
+    "EstimateOptions": "estimate.estimator",
+    "ObjectModel": "mesh.model",
     "Pose": "geometry",
-    "PoseEstimator": "estimate",
+    "PoseEstimator": "estimate.estimator",
     "Renderer": "render",
     "Result": "api",
     "View": "view",
@@ -52,7 +52,7 @@ __all__ = [
 
 
 class _EstimateModule(ModuleType):
-    """posekit.estimate, the module, which can be called: `posekit.api.estimate` has the same name."""
+    """posekit.estimate, the package, which can be called: `posekit.api.estimate` has the same name."""
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         return import_module("posekit.api").estimate(*args, **kwargs)

@@ -1,4 +1,4 @@
-"""A pose in one call: ``from posekit import estimate``. Layer 6."""
+"""A pose in one call: ``from posekit import estimate``."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from typing import overload
 import numpy as np
 from numpy.typing import NDArray
 
-from posekit import draw, figures
-from posekit.calibration import Calibration, load_calibration
 from posekit.camera import Camera
 from posekit.detect import BoxPrompt, MaskPrompt
 from posekit.errors import ImageError, OutputError, PromptError
-from posekit.estimate import EstimateOptions, PoseEstimator
-from posekit.files import write_bytes_atomic, write_text_atomic
+from posekit.estimate.estimator import EstimateOptions, PoseEstimator
+from posekit.estimate.instances import find_instances
 from posekit.geometry import Pose
+from posekit.io.calibration import Calibration, load_calibration
+from posekit.io.files import write_bytes_atomic, write_text_atomic
+from posekit.io.load import ASSUMED_FOV, load_mask, load_view
 from posekit.lens import Lens
-from posekit.load import ASSUMED_FOV, load_mask, load_view
-from posekit.object_model import ObjectModel
+from posekit.mesh.model import ObjectModel
 from posekit.results import Detection, Estimate, estimates_to_json
-from posekit.search import find_instances
 from posekit.view import View
+from posekit.visualise import draw, figures
 
 log = logging.getLogger("posekit")
 
@@ -202,7 +202,7 @@ def _found(
         return BoxPrompt(edges).detect(view, [estimator.model])
     if mask is not None:
         return MaskPrompt(_mask_of(mask, view.lens)).detect(view, [estimator.model])
-    from posekit.novel import make_detector
+    from posekit.detect.novel import make_detector
 
     finder, _ = make_detector(None, [estimator.model], most=CANDIDATES, doubtful=True)
     return finder.detect(view, [estimator.model])

@@ -1,4 +1,4 @@
-"""Rigid poses as values, and how to disturb them. Layer 0: NumPy only."""
+"""Rigid poses as values, and how to disturb them. NumPy only."""
 
 from __future__ import annotations
 

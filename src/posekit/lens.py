@@ -1,4 +1,4 @@
-"""Lens: distortion as OpenCV models it, and pictures without it. Layer 0."""
+"""Lens: distortion as OpenCV models it, and pictures without it."""
 
 from __future__ import annotations
 

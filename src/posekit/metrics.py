@@ -1,4 +1,4 @@
-"""How far a pose is from the truth: the field's measures, as functions. Layer 2.
+"""How far a pose is from the truth: the field's measures, as functions.
 
 Poses are ``T_cam_obj``: one `Pose`, a sequence of N, or matrices (4, 4) or (N, 4, 4); estimates and truths broadcast.
 One pose gives a number, N poses give (N,). Symmetries are transforms ``T_obj_obj`` with the identity among them, as

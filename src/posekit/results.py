@@ -1,4 +1,4 @@
-"""Detection and Estimate, and their JSON. Layer 1."""
+"""Detection and Estimate, and their JSON."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""View: a picture and its camera, never apart. Layer 1."""
+"""View: a picture and its camera, never apart."""
 
 from __future__ import annotations
 

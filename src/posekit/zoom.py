@@ -1,4 +1,4 @@
-"""Which 4:3 window to look at: round a box, or round a pose. Layer 2."""
+"""Which 4:3 window to look at: round a box, or round a pose."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from posekit.camera import Box, Camera, Zoom
 from posekit.geometry import Pose, cube_views, rotation_between
-from posekit.object_model import ObjectModel
+from posekit.mesh.model import ObjectModel
 
 Array = NDArray[np.float64]
 

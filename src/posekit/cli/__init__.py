@@ -1,1 +1,1 @@
-"""The command line: parse, call, print. Layer 6."""
+"""The command line: parse, call, print."""

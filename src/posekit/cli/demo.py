@@ -25,12 +25,12 @@ def demo(
 
     import numpy as np
 
-    from posekit import draw
-    from posekit.data.example import make_example, ply
     from posekit.detect import BoxPrompt
-    from posekit.estimate import PoseEstimator
+    from posekit.estimate.estimator import PoseEstimator
     from posekit.metrics import pose_error
     from posekit.render import Renderer
+    from posekit.synth.example import make_example, ply
+    from posekit.visualise import draw
 
     with destination.working("making the example"):
         example = make_example(Renderer(), seed)

@@ -23,7 +23,7 @@ from posekit.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from posekit.object_model import ObjectModel
+    from posekit.mesh.model import ObjectModel
     from posekit.results import Detection
     from posekit.view import View
 
@@ -64,13 +64,13 @@ def detect(
     """Find objects in a photograph: boxes, masks and scores, as COCO and BOP JSON."""
     from posekit.cli.output import OutputFolder
     from posekit.detect.external import to_bop, to_coco
-    from posekit.draw import png
+    from posekit.detect.novel import NovelDetector, NovelOptions, make_detector
     from posekit.errors import ConfigError
-    from posekit.figures import detections_overlay
-    from posekit.load import load_view
-    from posekit.novel import NovelDetector, NovelOptions, make_detector
-    from posekit.object_model import ObjectModel
-    from posekit.search import SearchOptions
+    from posekit.estimate.instances import SearchOptions
+    from posekit.io.load import load_view
+    from posekit.mesh.model import ObjectModel
+    from posekit.visualise.draw import png
+    from posekit.visualise.figures import detections_overlay
 
     if verify and not model:
         raise ConfigError("--verify looks for poses of meshes: pass --model MESH, or leave it out.")
@@ -109,8 +109,8 @@ def detect(
 
 def _verified(view: View, found: Sequence[Detection], meshes: Sequence[ObjectModel], least: float) -> list[Detection]:
     """What a pose speaks for, best first, scored by it."""
-    from posekit.estimate import Estimators
-    from posekit.search import SearchOptions, find_instances, judged
+    from posekit.estimate.estimator import Estimators
+    from posekit.estimate.instances import SearchOptions, find_instances, judged
 
     results = find_instances(Estimators(), view, meshes, found, SearchOptions(least=least))
     kept = [d for each in results for d in judged(each) if d.score >= least]

@@ -16,8 +16,8 @@ def download(
     keep: Annotated[bool, typer.Option("--keep", help="Keep the archives.")] = False,
 ) -> None:
     """Fetch a data set in BOP layout; a download that was interrupted goes on where it stopped."""
-    from posekit.data.datasets import data_folder, dataset_info
-    from posekit.data.download import download as fetch
+    from posekit.datasets.download import download as fetch
+    from posekit.datasets.registry import data_folder, dataset_info
 
     info = dataset_info(name)
     folder = data_folder() if root is None else root

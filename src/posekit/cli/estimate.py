@@ -105,10 +105,10 @@ def estimate(
     destination = Destination.chosen(out, Path("posekit-out") / image.stem, force, json, format_ or ())
 
     from posekit.cli.prompts import prompt_for
-    from posekit.estimate import EstimateOptions, Estimators
-    from posekit.load import load_view
-    from posekit.object_model import ObjectModel
-    from posekit.search import SearchOptions, find_instances
+    from posekit.estimate.estimator import EstimateOptions, Estimators
+    from posekit.estimate.instances import SearchOptions, find_instances
+    from posekit.io.load import load_view
+    from posekit.mesh.model import ObjectModel
 
     use_threads(threads)
     options = EstimateOptions(
@@ -119,7 +119,7 @@ def estimate(
     finder = prompt_for(box, mask, mask_from, detections, image, view.lens)
     asked = finder is not None
     if finder is None:
-        from posekit.novel import make_detector
+        from posekit.detect.novel import make_detector
 
         with destination.working("loading the detector"):
             candidates = max(CANDIDATES, instances + 1)

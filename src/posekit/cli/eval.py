@@ -125,7 +125,7 @@ def evaluate(
 
         _print_comparison(compare(*comparison, seed=seed))
         return
-    from posekit.estimate import EstimateOptions
+    from posekit.estimate.estimator import EstimateOptions
     from posekit.evaluate import EvalOptions
     from posekit.evaluate import evaluate as run
 
@@ -175,7 +175,7 @@ def _objects(text: str | None, dataset: str | None, root: Path | None, split: st
     parts = [part.strip() for part in text.split(",")]
     if all(part.isdigit() for part in parts):
         return tuple(int(part) for part in parts)
-    from posekit.data.datasets import open_dataset
+    from posekit.datasets.registry import open_dataset
 
     _, info = open_dataset(dataset, root, split)
     return tuple(int(part) if part.isdigit() else info.number(part) for part in parts)

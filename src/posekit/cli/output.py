@@ -15,17 +15,17 @@ import typer
 
 from posekit.cli.options import NOT_RELIABLE
 from posekit.errors import OutputError
-from posekit.files import check_writable, write_bytes_atomic, write_text_atomic
 from posekit.geometry import rotation_angle
-from posekit.pose_formats import NamedPose, check_formats, pose_files
+from posekit.io.files import check_writable, write_bytes_atomic, write_text_atomic
+from posekit.io.pose_formats import NamedPose, check_formats, pose_files
 from posekit.results import Estimate
 
 SMALL = 40  # pixels, longer side of an object's box below which that is said
 log = logging.getLogger("posekit")
 
 if TYPE_CHECKING:
-    from posekit.estimate import PoseEstimator
-    from posekit.object_model import ObjectModel
+    from posekit.estimate.estimator import PoseEstimator
+    from posekit.mesh.model import ObjectModel
     from posekit.view import View
 
 
@@ -172,8 +172,8 @@ class Destination:
 
 def _overlay(view: View, results: Sequence[tuple[PoseEstimator, Sequence[Estimate]]], blend: float) -> bytes:
     """All objects in one picture, PNG."""
-    from posekit import draw
-    from posekit.figures import overlay
+    from posekit.visualise import draw
+    from posekit.visualise.figures import overlay
 
     found = [(estimator.model, estimate) for estimator, estimates in results for estimate in estimates]
     return draw.png(overlay(results[0][0].renderer, view, found, blend))

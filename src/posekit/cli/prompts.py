@@ -7,8 +7,8 @@ from pathlib import Path
 from posekit.cli.options import MaskFrom
 from posekit.detect import BoxPrompt, Detector, MaskPrompt
 from posekit.errors import PromptError
+from posekit.io.load import load_mask, parse_box
 from posekit.lens import Lens
-from posekit.load import load_mask, parse_box
 
 
 def detector_for(box: str | None, mask: Path | None, mask_from: MaskFrom, lens: Lens | None = None) -> Detector:

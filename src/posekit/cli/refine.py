@@ -81,9 +81,9 @@ def refine(
     destination = Destination.chosen(out, Path("posekit-out") / f"{image.stem}-refined", force, json, format_ or ())
 
     from posekit.cli.prompts import detector_for
-    from posekit.estimate import EstimateOptions, PoseEstimator
-    from posekit.load import load_pose, load_view
-    from posekit.object_model import ObjectModel
+    from posekit.estimate.estimator import EstimateOptions, PoseEstimator
+    from posekit.io.load import load_pose, load_view
+    from posekit.mesh.model import ObjectModel
 
     use_threads(threads)
     options = EstimateOptions(

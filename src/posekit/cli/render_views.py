@@ -35,12 +35,12 @@ def render_views(
     if not 1 <= views <= _MOST_VIEWS:
         raise ConfigError(f"--views {views}: from 1 to {_MOST_VIEWS} can be drawn.")
 
-    from posekit import draw
     from posekit.camera import Camera
     from posekit.cli.output import OutputFolder
-    from posekit.object_model import ObjectModel
+    from posekit.mesh.model import ObjectModel
     from posekit.render import Renderer, centred_poses, render_views, view_rotations
     from posekit.render.views import DEFAULT_FOV
+    from posekit.visualise import draw
 
     folder = OutputFolder.chosen(out, Path("posekit-out") / f"{model.stem}-views", force)
     mesh = ObjectModel.load(model, units=units)

@@ -13,7 +13,7 @@ from posekit.cli.options import Units
 from posekit.errors import ConfigError
 
 if TYPE_CHECKING:
-    from posekit.data.synth.run import Show
+    from posekit.synth.run import Show
 
 WHAT, LOOK, MACHINE = "What", "Look", "Machine"
 PER_OBJECT, DEFAULT = 5000, 1000  # images, the paper's for each object (section 4.1), and of other kinds
@@ -79,8 +79,8 @@ def synth(
 ) -> None:
     """Make a data set of your meshes: images, depth, masks and poses in BOP layout."""
     from posekit.cli.render_views import _parse_size
-    from posekit.data.synth.plan import SynthConfig
-    from posekit.data.synth.run import Machines, begin, run
+    from posekit.synth.plan import SynthConfig
+    from posekit.synth.run import Machines, begin, run
 
     machines, given = Machines(workers, ray), [*(models or ()), *(more or ())]
     if resume and given:
@@ -88,8 +88,8 @@ def synth(
     if not resume:
         if not given:
             raise ConfigError("a data set needs meshes: pass --models DIR or --models FILE.")
-        from posekit.data.synth.objects import read_objects
-        from posekit.data.synth.run import check_new
+        from posekit.synth.objects import read_objects
+        from posekit.synth.run import check_new
 
         check_new(out)
         objects = read_objects(given, units, symmetry)

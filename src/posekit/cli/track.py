@@ -34,9 +34,9 @@ from posekit.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from posekit.pose_formats import NamedPose
-    from posekit.track import Tracked, Tracker
-    from posekit.video import Frame, Frames, VideoWriter
+    from posekit.io.pose_formats import NamedPose
+    from posekit.io.video import Frame, Frames, VideoWriter
+    from posekit.tracking.tracker import Tracked, Tracker
 
 COLUMNS = "scene_id,im_id,obj_id,score,R,t,time"
 
@@ -105,18 +105,18 @@ def track(
 ) -> None:
     """Follow objects through a video: poses as they come, and an overlay to look at."""
     from posekit.cli.output import OutputFolder
-    from posekit.pose_formats import check_formats, pose_files
+    from posekit.io.pose_formats import check_formats, pose_files
 
     check_formats(format_ or ())
 
     folder = OutputFolder.chosen(out, Path("posekit-out") / f"{Path(source).stem or 'camera'}-track", force)
 
     from posekit.errors import ImageError, PromptError
-    from posekit.estimate import Estimators
-    from posekit.load import load_pose
-    from posekit.object_model import ObjectModel
-    from posekit.track import TrackConfig, Tracker
-    from posekit.video import ReadAhead, open_frames
+    from posekit.estimate.estimator import Estimators
+    from posekit.io.load import load_pose
+    from posekit.io.video import ReadAhead, open_frames
+    from posekit.mesh.model import ObjectModel
+    from posekit.tracking.tracker import TrackConfig, Tracker
 
     if pose and len(pose) != len(model):
         raise PromptError(f"{len(pose)} --pose for {len(model)} --model: give one for each, in their order, or none.")
@@ -136,7 +136,7 @@ def track(
     sequence = ReadAhead(open_frames(source, camera), latest=live)
     finder = None
     if not pose or detector is not None:
-        from posekit.novel import make_detector
+        from posekit.detect.novel import make_detector
 
         finder, _ = make_detector(detector, meshes, doubtful=True)
     estimators = Estimators(preset=preset, weights=weights, device=device)
@@ -191,7 +191,7 @@ def _run(
     formats that are written at the end."""
     from posekit.cli.output import named_pose
     from posekit.errors import OutputError
-    from posekit.video import VideoWriter
+    from posekit.io.video import VideoWriter
 
     counts = _Counts()
     try:
@@ -231,7 +231,7 @@ def _run(
 
 
 def _step(trackers: Sequence[Tracker], frame: Frame, counts: _Counts) -> list[Tracked]:
-    from posekit.track import LOST, Tracked
+    from posekit.tracking.tracker import LOST, Tracked
 
     if frame.image is None or frame.camera is None:
         counts.problems.append(frame.problem)
@@ -282,8 +282,8 @@ def _number(name: str, k: int) -> int:
 
 
 def _draw(writer: VideoWriter, frame: Frame, trackers: Sequence[Tracker], results: Sequence[Tracked]) -> None:
-    from posekit import draw
-    from posekit.figures import outlined
+    from posekit.visualise import draw
+    from posekit.visualise.figures import outlined
 
     assert frame.image is not None and frame.camera is not None
     picture, told = frame.image, []
@@ -305,7 +305,7 @@ def _recorder(path: Path, trackers: Sequence[Tracker], wanted: bool) -> Iterator
     if not wanted:
         yield lambda *_: None
         return
-    from posekit.recording import Recorder
+    from posekit.visualise.recording import Recorder
 
     with Recorder(path, [tracker.model for tracker in trackers]) as recorder:
 

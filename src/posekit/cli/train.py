@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from posekit.cli.options import ForceOption, Units
-from posekit.files import check_writable
+from posekit.io.files import check_writable
 
 if TYPE_CHECKING:
     from posekit.train.config import TrainConfig

@@ -1,4 +1,4 @@
-"""Where the objects are. Layer 2."""
+"""Where the objects are."""
 
 from posekit.detect.prompts import BoxPrompt, Detector, MaskPrompt
 

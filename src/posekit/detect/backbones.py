@@ -1,4 +1,4 @@
-"""The networks below Mask R-CNN, by name: ``resnet50`` (the paper's) and ``lite0`` (EfficientNet-Lite0). Layer 2.
+"""The networks below Mask R-CNN, by name: ``resnet50`` (the paper's) and ``lite0`` (EfficientNet-Lite0).
 
 EfficientNet-Lite0 (Tan and Le, 2019; the Lite variant without squeeze-and-excitation, with ReLU6) keeps its batch norms
 folded into the convolutions: with small batches they would be frozen anyway.

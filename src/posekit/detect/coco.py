@@ -1,4 +1,4 @@
-"""COCO's measure of detections: average precision. Layer 2."""
+"""COCO's measure of detections: average precision."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Detections in files: BOP's and COCO's JSON, to and from. Layer 2."""
+"""Detections in files: BOP's and COCO's JSON, to and from."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from posekit.camera import Box, mask_box
 from posekit.detect.prompts import clip_box
 from posekit.detect.segmentation import decode, encode, xywh
 from posekit.errors import PromptError
-from posekit.object_model import ObjectModel
+from posekit.mesh.model import ObjectModel
 from posekit.results import Detection, Source
 from posekit.view import View
 

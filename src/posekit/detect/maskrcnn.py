@@ -1,4 +1,4 @@
-"""Mask R-CNN (He et al., 2017), from torchvision: its shape, its weights on disk, and detection with it. Layer 2."""
+"""Mask R-CNN (He et al., 2017), from torchvision: its shape, its weights on disk, and detection with it."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from posekit.detect.backbones import BACKBONES, LITE0_MEAN, LITE0_STD, feature_p
 from posekit.detect.sharpen import sharpened
 from posekit.detect.vision import torchvision
 from posekit.errors import ConfigError, WeightsError
-from posekit.files import write_bytes_atomic, write_text_atomic
-from posekit.object_model import ObjectModel
+from posekit.io.files import write_bytes_atomic, write_text_atomic
+from posekit.mesh.model import ObjectModel
 from posekit.results import Detection, Source
 from posekit.view import View
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from posekit.camera import Box, Camera, mask_box
 from posekit.errors import PromptError
-from posekit.object_model import ObjectModel
+from posekit.mesh.model import ObjectModel
 from posekit.results import Detection, Source
 from posekit.view import View
 

@@ -1,4 +1,4 @@
-"""Masks and boxes as COCO's and BOP's files have them. Layer 2."""
+"""Masks and boxes as COCO's and BOP's files have them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A network's mask laid onto the colours of the photograph, by GrabCut (Rother et al., 2004). Layer 2."""
+"""A network's mask laid onto the colours of the photograph, by GrabCut (Rother et al., 2004)."""
 
 from __future__ import annotations
 

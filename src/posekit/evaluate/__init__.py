@@ -1,4 +1,4 @@
-"""Data set + estimator -> tables: stages, scores, results, report, comparison. Layer 5."""
+"""Data set + estimator -> tables: stages, scores, results, report, comparison."""
 
 from posekit.evaluate.compare import Comparison, Difference, compare
 from posekit.evaluate.options import EvalOptions

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from posekit.errors import ConfigError
-from posekit.estimate import EstimateOptions
+from posekit.estimate.estimator import EstimateOptions
 from posekit.geometry import PoseNoise
 
 STAGES = ("refine", "estimate", "track", "score")

@@ -11,13 +11,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from posekit import draw, metrics
-from posekit.data.datasets import Dataset
+from posekit import metrics
+from posekit.datasets.registry import Dataset
 from posekit.evaluate import charts, table
 from posekit.evaluate.scoring import MEASURES, Case, Guess, Scored
-from posekit.figures import outlined
 from posekit.geometry import Pose
 from posekit.render import Renderer
+from posekit.visualise import draw
+from posekit.visualise.figures import outlined
 from posekit.zoom import zoom_to_pose
 
 SHOWN = 20  # cases, the best and the worst

@@ -14,10 +14,10 @@ import numpy as np
 
 from posekit import metrics
 from posekit._version import __version__
-from posekit.data.datasets import Dataset, DatasetInfo, open_dataset
+from posekit.datasets.registry import Dataset, DatasetInfo, open_dataset
+from posekit.datasets.results_csv import ResultRow, csv_name, read_results, results_csv
 from posekit.errors import ConfigError, OutputError
 from posekit.evaluate import table
-from posekit.evaluate.bop_results import ResultRow, csv_name, read_results, results_csv
 from posekit.evaluate.options import EvalOptions
 from posekit.evaluate.report import report
 from posekit.evaluate.scoring import Case, Guess, Scored, score
@@ -26,8 +26,8 @@ from posekit.evaluate.store import RunFolder
 from posekit.evaluate.truths import TruthReader, pictures, selected
 from posekit.evaluate.vsd import VsdMeter
 from posekit.evaluate.workers import run_pictures
-from posekit.files import check_writable, write_text_atomic
 from posekit.geometry import Pose
+from posekit.io.files import check_writable, write_text_atomic
 from posekit.nets.weights import load_networks
 
 log = logging.getLogger("posekit")

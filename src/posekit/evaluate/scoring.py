@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from posekit import metrics
-from posekit.data.bop import MeasuredModel
-from posekit.data.datasets import Dataset, DatasetInfo
+from posekit.datasets.bop import MeasuredModel
+from posekit.datasets.registry import Dataset, DatasetInfo
 from posekit.geometry import Pose
 
 Array = NDArray[np.float64]

@@ -17,23 +17,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from posekit.camera import Box, mask_box
-from posekit.data.datasets import open_dataset
+from posekit.datasets.registry import open_dataset
+from posekit.datasets.results_csv import FoundRegion, read_detections
 from posekit.detect import BoxPrompt, Detector
 from posekit.detect.external import are_corners
+from posekit.detect.novel import make_detector
 from posekit.detect.prompts import clip_box
 from posekit.detect.segmentation import encode, xywh
 from posekit.errors import PromptError
-from posekit.estimate import Estimators, PoseEstimator
-from posekit.evaluate.bop_results import FoundRegion, read_detections
+from posekit.estimate.estimator import Estimators, PoseEstimator
+from posekit.estimate.instances import SearchOptions, find_instances, judged
 from posekit.evaluate.options import DETECTOR, GIVEN, EvalOptions
 from posekit.evaluate.tracking import Sequences
 from posekit.evaluate.truths import Truth, TruthReader, pictures, selected
 from posekit.geometry import Pose
+from posekit.mesh.model import ObjectModel
 from posekit.metrics import box_iou
-from posekit.novel import make_detector
-from posekit.object_model import ObjectModel
 from posekit.results import Detection, Estimate, Source
-from posekit.search import SearchOptions, find_instances, judged
 from posekit.view import View
 
 log = logging.getLogger("posekit")

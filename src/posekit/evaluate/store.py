@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from posekit.errors import OutputError
-from posekit.files import write_text_atomic
+from posekit.io.files import write_text_atomic
 
 Picture = tuple[int, int]
 

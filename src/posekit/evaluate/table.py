@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from posekit._version import __version__
-from posekit.data.datasets import DatasetInfo
+from posekit.datasets.registry import DatasetInfo
 from posekit.evaluate.scoring import MEASURES, Scored
 from posekit.nets.precision import usable_cores
 

@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from posekit.camera import mask_box
-from posekit.estimate import PoseEstimator
+from posekit.estimate.estimator import PoseEstimator
 from posekit.evaluate.truths import Truth
-from posekit.object_model import ObjectModel
+from posekit.mesh.model import ObjectModel
 from posekit.results import Detection, Source
-from posekit.track import TrackConfig, Tracked, Tracker
+from posekit.tracking.tracker import TrackConfig, Tracked, Tracker
 from posekit.view import View
 
 

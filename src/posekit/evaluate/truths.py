@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from posekit.camera import Box, mask_box
-from posekit.data.bop import Instance
-from posekit.data.datasets import Dataset
+from posekit.datasets.bop import Instance
+from posekit.datasets.registry import Dataset
 from posekit.evaluate.options import EvalOptions
 from posekit.render import Renderer
 

@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from posekit import metrics
 from posekit.camera import Box, Camera
-from posekit.data.datasets import Dataset
+from posekit.datasets.registry import Dataset
 from posekit.evaluate.scoring import SHARES, Case, Guess
 from posekit.geometry import Pose
-from posekit.object_model import ObjectModel
+from posekit.mesh.model import ObjectModel
 from posekit.render import Renderer
 
 _STEP = 64  # sizes of windows are multiples of this many pixels, so that few framebuffers are needed

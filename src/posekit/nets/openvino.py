@@ -1,4 +1,4 @@
-"""SV-Net of the lite preset through OpenVINO: the same answers as PyTorch's, faster on a CPU. Layer 2.
+"""SV-Net of the lite preset through OpenVINO: the same answers as PyTorch's, faster on a CPU.
 
 The converted network is kept in the user's cache (XDG_CACHE_HOME), by the weights' digest: converting takes seconds.
 """

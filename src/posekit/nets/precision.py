@@ -1,4 +1,4 @@
-"""What the hardware offers: bfloat16, cores. Layer 2."""
+"""What the hardware offers: bfloat16, cores."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From views to predictions: SV-Net behind one call, in batches. Layer 2."""
+"""From views to predictions: SV-Net behind one call, in batches."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The rigid motion that a weighted flow implies, differentiable: Gauss-Newton on reprojection. Layer 2.
+"""The rigid motion that a weighted flow implies, differentiable: Gauss-Newton on reprojection.
 
 Training through it teaches the weights what a PnP solver does with them, and the flow what the pose needs (EPro-PnP,
 Chen et al., 2022; GenFlow, Moon et al., 2024). The rendered surface is known only up to its distance, and that

@@ -17,7 +17,7 @@ from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from posekit.errors import WeightsError
-from posekit.files import write_bytes_atomic, write_text_atomic
+from posekit.io.files import write_bytes_atomic, write_text_atomic
 from posekit.nets.lite import LiteConfig, LiteSVNet
 from posekit.nets.mvnet import MatchingMVNet
 from posekit.nets.paper import Branch, PaperMVNet, PaperSVNet

@@ -1,4 +1,4 @@
-"""Drawing meshes: off-screen OpenGL, exact to the pixel convention. Layer 2."""
+"""Drawing meshes: off-screen OpenGL, exact to the pixel convention."""
 
 from posekit.render.context import info
 from posekit.render.light import Light

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from posekit.camera import Camera
 from posekit.geometry import Pose
-from posekit.object_model import ObjectModel
+from posekit.mesh.model import ObjectModel
 from posekit.render.light import Light
 
 _ANISOTROPY = 8.0

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from posekit.camera import Camera
 from posekit.errors import RenderError
 from posekit.geometry import Pose
-from posekit.object_model import ObjectModel
+from posekit.mesh.model import ObjectModel
 from posekit.render import context
 from posekit.render.gpu import Draw, Mesh, Pass, Program, Target
 from posekit.render.light import DEFAULT_LIGHT, Light

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from posekit.camera import Camera
 from posekit.geometry import Pose, cube_views, fibonacci_sphere, view_rotation
-from posekit.object_model import ObjectModel
+from posekit.mesh.model import ObjectModel
 from posekit.render.light import DEFAULT_LIGHT, Light
 from posekit.render.renderer import Renderer
 from posekit.view import View

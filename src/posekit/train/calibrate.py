@@ -1,4 +1,4 @@
-"""The predicted angle, made honest: SV-Net's angle head, fitted to what refinement really leaves. Layer 5.
+"""The predicted angle, made honest: SV-Net's angle head, fitted to what refinement really leaves.
 
 In a training the head sees poses disturbed at random. The loop asks it about poses that the network itself has moved,
 where what is left is what the network cannot see: there the head was far too sure. So once the rest is trained, the
@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from posekit.errors import TrainingError
+from posekit.estimate.refine import compare, update_pose
 from posekit.geometry import Pose, random_rotation, rotation_angle
 from posekit.nets.heads import compress_angle
 from posekit.nets.predictor import NetworkPredictor
 from posekit.nets.weights import Networks
-from posekit.refine import compare, update_pose
 from posekit.render import Renderer
 from posekit.train.measure import Case
 

@@ -1,4 +1,4 @@
-"""Checkpoints: ``STEP.safetensors`` (tensors) beside ``STEP.toml`` (numbers). No pickle. Layer 5.
+"""Checkpoints: ``STEP.safetensors`` (tensors) beside ``STEP.toml`` (numbers). No pickle.
 
 The TOML file is written last and names the other's hash: a checkpoint without it does not count, so that a kill at any
 moment leaves the one before in force.
@@ -22,7 +22,7 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from posekit.errors import OutputError, WeightsError
-from posekit.files import write_bytes_atomic, write_text_atomic
+from posekit.io.files import write_bytes_atomic, write_text_atomic
 
 
 @dataclass(frozen=True, eq=False)

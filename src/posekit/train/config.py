@@ -1,4 +1,4 @@
-"""What a training does, as one frozen dataclass and a TOML file of the same shape. Layer 5."""
+"""What a training does, as one frozen dataclass and a TOML file of the same shape."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from typing import Any, TypeVar
 
 import tomli_w
 
-from posekit.data.stream import StreamConfig
 from posekit.errors import ConfigError
 from posekit.nets.lite import LiteConfig
 from posekit.nets.losses import DenseLossConfig
 from posekit.nets.weights import PaperConfig
+from posekit.train.data.stream import StreamConfig
 
 RECIPES = ("lite", "paper")
 OPTIMISERS = ("adamw", "sgd")

@@ -1,4 +1,4 @@
-"""Train Mask R-CNN on composed scenes: for given meshes, or class-agnostic for objects of any kind. Layer 5."""
+"""Train Mask R-CNN on composed scenes: for given meshes, or class-agnostic for objects of any kind."""
 
 from __future__ import annotations
 
@@ -16,15 +16,6 @@ from torch import Tensor, nn
 from torch.utils.data import IterableDataset
 
 from posekit._version import __version__
-from posekit.data.stream import Batch
-from posekit.data.tabletop_stream import (
-    AGNOSTIC_SHARE,
-    LabelledImage,
-    TabletopStream,
-    TabletopStreamConfig,
-    labelled_scenes,
-    photographed,
-)
 from posekit.detect.coco import Truth, average_precision
 from posekit.detect.maskrcnn import (
     NOVEL,
@@ -37,9 +28,18 @@ from posekit.detect.maskrcnn import (
     save_detector,
 )
 from posekit.errors import ConfigError, OutputError
-from posekit.files import write_text_atomic
+from posekit.io.files import write_text_atomic
 from posekit.render import Renderer
 from posekit.train.config import MachineConfig, OptimiserConfig, SourceConfig, changed, write_config
+from posekit.train.data.stream import Batch
+from posekit.train.data.tabletop_stream import (
+    AGNOSTIC_SHARE,
+    LabelledImage,
+    TabletopStream,
+    TabletopStreamConfig,
+    labelled_scenes,
+    photographed,
+)
 from posekit.train.loop import Show, Trainer, make_fabric
 from posekit.train.pose import CONFIG, claim, is_first
 from posekit.train.sources import Sources, read_sources

@@ -1,4 +1,4 @@
-"""The lite recipe: SV-Net on rendered pairs, MV-Net beside it on boxed crops, one tower for both. Layer 5."""
+"""The lite recipe: SV-Net on rendered pairs, MV-Net beside it on boxed crops, one tower for both."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import IterableDataset
 
-from posekit.data.stream import Batch, PairStream
 from posekit.nets.inputs import images_to_tensor
 from posekit.nets.lite import LiteSVNet
 from posekit.nets.losses import DenseLossConfig, Target, dense_loss
@@ -16,6 +15,7 @@ from posekit.nets.mvnet import rgb_input, view_input
 from posekit.nets.mvnet_loss import mvnet_loss
 from posekit.nets.weights import Networks
 from posekit.train.config import TrainConfig
+from posekit.train.data.stream import Batch, PairStream
 from posekit.train.sources import Sources
 from posekit.train.task import PoseTask
 

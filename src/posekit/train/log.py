@@ -1,4 +1,4 @@
-"""A training's curves: CSV files and TensorBoard. Layer 5."""
+"""A training's curves: CSV files and TensorBoard."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from posekit.errors import ConfigError, OutputError
-from posekit.files import write_text_atomic
+from posekit.io.files import write_text_atomic
 
 
 class Curves:

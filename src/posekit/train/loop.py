@@ -1,4 +1,4 @@
-"""The training loop, on Lightning Fabric: one process or many, CPU or GPU. Layer 5.
+"""The training loop, on Lightning Fabric: one process or many, CPU or GPU.
 
     with batches:  loss, backward, clip, step, average
     now and then:  log, validate, export, checkpoint
@@ -29,7 +29,7 @@ from torch.optim.swa_utils import AveragedModel
 from torch.utils.data import DataLoader, IterableDataset
 
 from posekit.errors import ConfigError, TrainingError
-from posekit.files import write_text_atomic
+from posekit.io.files import write_text_atomic
 from posekit.nets.precision import has_fast_bfloat16
 from posekit.train.checkpoint import Checkpoint, Checkpoints, optimiser_tensors, part, restore_optimiser
 from posekit.train.config import MachineConfig, OptimiserConfig

@@ -1,4 +1,4 @@
-"""How good networks are: the refinement loop on cases that the training does not see. Layer 5."""
+"""How good networks are: the refinement loop on cases that the training does not see."""
 
 from __future__ import annotations
 
@@ -8,20 +8,27 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from posekit.data.appearance import variants
-from posekit.data.augment import AugmentConfig, observe
-from posekit.data.bop import BopDataset
-from posekit.data.procedural import random_object
-from posekit.data.scenes import SceneConfig, disturbed_box, disturbed_pose, render_scenes, usable_instances, view_of
+from posekit.datasets.bop import BopDataset
+from posekit.estimate.refine import RefineOptions, refine
+from posekit.first_pose.mvnet import FirstPoseSearch, mvnet_search
 from posekit.geometry import Pose
+from posekit.mesh.model import ObjectModel
 from posekit.metrics import add, pose_error, within
-from posekit.mvnet_search import FirstPoseSearch, mvnet_search
 from posekit.nets.predictor import NetworkPredictor
 from posekit.nets.weights import Networks
-from posekit.object_model import ObjectModel
-from posekit.refine import RefineOptions, refine
 from posekit.render import Renderer
 from posekit.results import Detection, Source
+from posekit.synth.appearance import variants
+from posekit.synth.procedural import random_object
+from posekit.train.data.augment import AugmentConfig, observe
+from posekit.train.data.crops import (
+    SceneConfig,
+    disturbed_box,
+    disturbed_pose,
+    render_scenes,
+    usable_instances,
+    view_of,
+)
 from posekit.view import View
 
 ITERATIONS = 4

@@ -1,4 +1,4 @@
-"""The paper's recipe: MV-Net and SV-Net trained together, end to end (section 3.4, equations 1 and 2). Layer 5.
+"""The paper's recipe: MV-Net and SV-Net trained together, end to end (section 3.4, equations 1 and 2).
 
 MV-Net's first estimate renders SV-Net's first sample, each of SV-Net's answers the next one, detached: SV-Net learns to
 mend what the networks get wrong. Where a first estimate is more than 25 degrees off, a sample with a small random
@@ -17,18 +17,18 @@ from torch import Tensor, nn
 from torch.utils.data import IterableDataset
 
 from posekit.camera import Camera, Zoom
-from posekit.data.scene_stream import Catalogue, SceneStream
-from posekit.data.scenes import Frontal, disturbed_pose, rgba_of, view_of
-from posekit.data.stream import Batch
 from posekit.geometry import Pose, nearest_rotation, quat_to_rotation, rotation_angle
+from posekit.mesh.model import ObjectModel
 from posekit.nets.inputs import images_to_tensor
 from posekit.nets.losses import mvnet_loss, svnet_loss
 from posekit.nets.paper import PaperMVNet, PaperSVNet
 from posekit.nets.pose_delta import PoseDelta, apply_delta, delta_between
 from posekit.nets.weights import Networks
-from posekit.object_model import ObjectModel
 from posekit.render import Renderer
 from posekit.train.config import TrainConfig
+from posekit.train.data.crop_stream import Catalogue, SceneStream
+from posekit.train.data.crops import Frontal, disturbed_pose, rgba_of, view_of
+from posekit.train.data.stream import Batch
 from posekit.train.sources import Sources
 from posekit.train.task import PoseTask
 from posekit.zoom import frontal_pose, zoom_to_pose

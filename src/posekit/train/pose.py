@@ -1,4 +1,4 @@
-"""Train the pose networks: from a configuration to a folder that ``estimate --weights`` takes. Layer 5."""
+"""Train the pose networks: from a configuration to a folder that ``estimate --weights`` takes."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from posekit._version import __version__
-from posekit.data.procedural import random_object
-from posekit.data.scene_stream import Catalogue
 from posekit.errors import ConfigError, OutputError, WeightsError
-from posekit.files import write_text_atomic
+from posekit.io.files import write_text_atomic
 from posekit.nets.lite import LiteConfig, LiteSVNet
 from posekit.nets.mvnet import MatchingMVNet
 from posekit.nets.weights import Networks, build, load_networks, save_networks
 from posekit.render import Renderer
+from posekit.synth.procedural import random_object
 from posekit.train.calibrate import SEED, calibrate
 from posekit.train.config import TrainConfig, read_config, write_config
+from posekit.train.data.crop_stream import Catalogue
 from posekit.train.lite import LiteTask
 from posekit.train.loop import Progress, Show, Task, Trainer, keep_memory, make_fabric
 from posekit.train.measure import CaseSource, rendered_cases

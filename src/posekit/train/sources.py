@@ -1,4 +1,4 @@
-"""What a training is fed with, read from where its configuration says. Layer 5."""
+"""What a training is fed with, read from where its configuration says."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from posekit.data.bop import BopDataset
-from posekit.data.stream import load_photos
+from posekit.datasets.bop import BopDataset
 from posekit.errors import ConfigError, MeshError
-from posekit.object_model import FORMATS, ObjectModel
+from posekit.mesh.model import ObjectModel
+from posekit.mesh.reading import FORMATS
 from posekit.train.config import SourceConfig
+from posekit.train.data.stream import load_photos
 
 TEXTURE = 512  # pixels: longer sides are shrunk, since a crop shows fewer
 log = logging.getLogger("posekit")

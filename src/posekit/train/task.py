@@ -1,4 +1,4 @@
-"""What the recipes share: measuring and exporting. Layer 5."""
+"""What the recipes share: measuring and exporting."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from typing import Any
 from torch import nn
 
 from posekit.errors import ConfigError
+from posekit.mesh.model import ObjectModel
 from posekit.nets.heads import PoseHeads
 from posekit.nets.weights import Networks, save_networks
-from posekit.object_model import ObjectModel
 from posekit.render import Renderer
 from posekit.train.config import TrainConfig
 from posekit.train.measure import Case, CaseSource, bop_cases, measure, rendered_cases

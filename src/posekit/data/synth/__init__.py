@@ -1,1 +1,0 @@
-"""Synthetic data sets in BOP layout: domain-randomised, photorealistic, scenes and sequences. Layer 3."""

@@ -1,0 +1,1 @@
+"""Data sets and their files: BOP, LINEMOD, results; millimetres become metres here."""

@@ -1,0 +1,1 @@
+"""From a photograph to poses: refinement, choice, one function for every caller."""

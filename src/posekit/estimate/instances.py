@@ -1,0 +1,114 @@
+"""From detections that may be wrong to objects' instances: estimate, keep what the render bears out.
+
+The one way from a picture, meshes and detections to poses, for ``posekit estimate``, ``eval``, ``detect --verify`` and
+the tracker's search.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+from posekit.camera import box_overlap
+from posekit.detect.novel import USUAL, WEIGHT, shifted
+from posekit.errors import ConfigError
+from posekit.mesh.model import ObjectModel
+from posekit.results import Detection, Estimate, Source
+from posekit.view import View
+
+
+class Estimator(Protocol):
+    """What a `PoseEstimator` does for the search."""
+
+    def estimate(self, view: View, detections: Sequence[Detection], least: float = 0.0) -> list[Estimate]: ...
+
+
+EstimatorOf = Callable[[ObjectModel], Estimator]
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """instances: kept at most; 0 = all. least: score of an estimate below which it is no instance. overlap: of the
+    boxes (intersection over union) from which two estimates are of one instance."""
+
+    instances: int = 1
+    least: float = 0.5
+    overlap: float = 0.5
+
+    def __post_init__(self) -> None:
+        if self.instances < 0 or not 0 <= self.least <= 1 or not 0 < self.overlap <= 1:
+            raise ConfigError("instances is not negative, least in [0, 1] and overlap in (0, 1].")
+
+    @classmethod
+    def usual(cls, detections: Sequence[Detection]) -> SearchOptions:
+        """By who says where the objects are. What a person says is taken as it is; what another program says gives all
+        instances that do not overlap; a detector's answers must be borne out by the render."""
+        sources = [detection.source for detection in detections]
+        if sources and all(source.given for source in sources):
+            return cls(0, 0.0, 1.0 if all(source.by_hand for source in sources) else 0.5)
+        return cls()
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What a picture shows of one mesh. detections: that were looked at. estimates: what they led to, in their order.
+    instances: those of the estimates that are kept, best first."""
+
+    model: ObjectModel
+    detections: Sequence[Detection]
+    estimates: Sequence[Estimate]
+    instances: Sequence[Estimate]
+
+
+def find_instances(
+    estimator_of: EstimatorOf,
+    view: View,
+    models: Sequence[ObjectModel],
+    detections: Sequence[Detection],
+    options: SearchOptions | None = None,
+) -> list[Found]:
+    """The instances of each model among a picture's detections, in the order of the models.
+
+    A detection belongs to the model whose name is its label, one without a label to every model. estimator_of: gives
+    a model's estimator; it is asked for models that have detections only. options: by default
+    `SearchOptions.usual`.
+    """
+    options = options or SearchOptions.usual(detections)
+    found = []
+    for model in models:
+        mine = [detection for detection in detections if detection.label in (None, model.name)]
+        estimates = estimates_of(estimator_of(model), view, mine, options) if mine else []
+        found.append(Found(model, mine, estimates, instances_of(estimates, options)))
+    return found
+
+
+def estimates_of(
+    estimator: Estimator, view: View, detections: Sequence[Detection], options: SearchOptions
+) -> list[Estimate]:
+    """An estimate for each detection that leads to one, in their order. What the novel detector found is scored by
+    how much it looks like the mesh as well: a logistic function's argument grows by `WEIGHT` times what the likeness
+    is above `USUAL` (docs/decisions/0015)."""
+    found = []
+    for detection in detections:
+        shift = WEIGHT * (detection.score - USUAL) if detection.source is Source.NOVEL else 0.0
+        for estimate in estimator.estimate(view, [detection], shifted(options.least, -shift)):
+            others = tuple(replace(e, score=shifted(e.score, shift)) for e in estimate.alternatives)
+            found.append(replace(estimate, score=shifted(estimate.score, shift), alternatives=others))
+    return found
+
+
+def instances_of(estimates: Sequence[Estimate], options: SearchOptions) -> list[Estimate]:
+    """Those of an object's estimates that are instances of it, best first."""
+    kept: list[Estimate] = []
+    for each in sorted(estimates, key=lambda e: -e.score):
+        if each.score >= options.least and all(box_overlap(each.box, k.box) < options.overlap for k in kept):
+            kept.append(each)
+    return kept[: options.instances] if options.instances else kept
+
+
+def judged(found: Found) -> list[Detection]:
+    """A model's detections with the scores of the estimates that they led to (0 where to none), best first."""
+    scores = {id(each.detection): each.score for each in found.estimates}
+    scored = [replace(each, score=scores.get(id(each), 0.0)) for each in found.detections]
+    return sorted(scored, key=lambda d: -d.score)

@@ -1,0 +1,1 @@
+"""First poses from a box: templates, evidence, MV-Net, local features."""

@@ -1,0 +1,434 @@
+"""Textured meshes found by local features: SIFT of rendered views, matched with a photograph's.
+
+RootSIFT descriptors (Lowe, 2004; Arandjelovic and Zisserman, 2012) of views from all sides, each with its place on the
+mesh; a robust PnP (OpenCV's USAC with MAGSAC's score) of the matches gives poses without any training. What a match
+says beside its place, the keypoint's size and turn, decides whether it bears a pose out.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import zipfile
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from weakref import WeakKeyDictionary
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from posekit.align.pnp import PnpConfig, solve_pnp
+from posekit.camera import Box, Camera
+from posekit.errors import OutputError
+from posekit.geometry import Pose, cube_views
+from posekit.io.files import user_cache, write_bytes_atomic
+from posekit.mesh.model import ObjectModel
+from posekit.render import Light, Renderer, centred_poses, view_rotations
+from posekit.view import View
+
+Array = NDArray[np.float64]
+FArray = NDArray[np.float32]
+
+
+VERSION = 1  # of what is kept on disk; a change of the views or of the extraction raises it
+KEPT = 100  # meshes whose features stay on disk
+SIDE = 256  # pixels of a rendered view
+FIELD = float(np.deg2rad(30.0))  # of a rendered view
+OF_VIEW, OF_PICTURE = 400, 8000  # keypoints at most, the strongest
+PLAIN_BELOW = 8  # keypoints of a view, in the median, below which a mesh has too little texture
+PICTURE_SIDES = 1280, 1920  # pixels of a whole picture's longer side: small ones are enlarged to the first
+BOX_SIDES = 384, 768  # likewise of a box
+MOST_ENLARGED = 2.0, 4.0  # of a picture, of a box
+BOX_MARGIN = 1.3
+ALIKE = 0.8  # cosine of two descriptors of one thing, where its place is known
+
+
+@dataclass(frozen=True)
+class FeatureOptions:
+    """ratio: of the descriptors' distances to the best and to the second best place of the mesh, at most. apart: of two
+    such places, in diameters. error: of a match, a share of the picture's longer side (or of the box's, where there is
+    one), and error_px, pixels at least. size: factor between a keypoint's size and the one that the pose gives it.
+    turn: radians, likewise. least: matches at different places that bear a pose out. share: of all matches with the
+    mesh's picture area. spread: of the projected mesh's area, within these matches. instances: at most. seed: of the
+    robust fit."""
+
+    ratio: float = 0.85
+    apart: float = 0.1
+    error: float = 0.004
+    error_px: float = 2.0
+    size: float = 1.6
+    turn: float = float(np.deg2rad(35.0))
+    least: int = 8
+    share: float = 0.3
+    spread: float = 0.05
+    instances: int = 5
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Keypoints:
+    """Of a picture. descriptors: (P, 128), RootSIFT. pixels: (P, 2), pixel centres. tips: (P, 2), pixels: along the
+    keypoint's turn, as long as its size."""
+
+    descriptors: FArray
+    pixels: Array
+    tips: Array
+
+
+@dataclass(frozen=True, eq=False)
+class FeatureModel:
+    """A mesh's features. descriptors: (N, 128), RootSIFT. points: (N, 3), metres in ``ctr``. tips: (N, 3), metres in
+    ``ctr``: the keypoint's size and turn. directions: (N, 3), unit, from the mesh's centre to the view that showed it.
+    plain: whether the mesh has too little texture to be found by."""
+
+    descriptors: FArray
+    points: Array
+    tips: Array
+    directions: Array
+    plain: bool
+
+    @classmethod
+    def of(cls, model: ObjectModel, renderer: Renderer) -> FeatureModel:
+        """From the user's cache, else from rendered views, which take some seconds and are then kept there."""
+        if model.texture is None and model.colors is None:
+            none = np.zeros((0, 3))
+            return cls(np.zeros((0, 128), np.float32), none, none, none, True)
+        kept = cache_file(model)
+        with suppress(OSError, ValueError, KeyError, zipfile.BadZipFile):  # not there yet, or damaged: made anew
+            return _read(kept)
+        made = _extracted(model, renderer)
+        with suppress(OSError, OutputError):  # a cache that cannot be written costs time only
+            _keep(kept, made)
+        return _decoded(*made)
+
+
+@dataclass(frozen=True, eq=False)
+class FeaturePose:
+    """An instance found. inliers: matches that bear it out, at different places. share: of the matches in its part of
+    the picture. points: (N, 3), metres in ``obj``; pixels: (N, 2), pixel centres: these matches. box: edges, of the
+    projected mesh."""
+
+    T_cam_obj: Pose
+    inliers: int
+    share: float
+    points: Array
+    pixels: Array
+    box: Box
+
+
+class FeatureSearch:
+    """Finds a mesh in photographs by its texture. The mesh's features are made at the first search."""
+
+    def __init__(self, model: ObjectModel, renderer: Renderer, options: FeatureOptions = FeatureOptions()) -> None:
+        self.model, self.renderer, self.options = model, renderer, options
+        self._features: FeatureModel | None = None
+
+    @property
+    def features(self) -> FeatureModel:
+        if self._features is None:
+            self._features = FeatureModel.of(self.model, self.renderer)
+        return self._features
+
+    def search(self, view: View, box: Box | None = None) -> list[FeaturePose]:
+        """The instances, most matches first; at once none where the mesh has too little texture. box: edges, where
+        an instance is looked for."""
+        known = self.features
+        if known.plain:
+            return []
+        seen = keypoints_of(view, box)
+        if len(seen.pixels) < self.options.least:
+            return []
+        alike = seen.descriptors @ known.descriptors.T
+        found: list[FeaturePose] = []
+        while len(found) < self.options.instances:
+            rows, columns = self._matches(alike)
+            one = self._instance(view.camera, seen, rows, columns, self._error(view.camera, box))
+            if one is None:
+                break
+            found.append(self._polished(view.camera, seen, alike, one, self._error(view.camera, box)))
+            alike[self._inside(view.camera, one.T_cam_obj, seen.pixels)] = -1.0
+        return sorted(found, key=lambda f: -f.inliers)
+
+    def _error(self, camera: Camera, box: Box | None) -> float:
+        """Of a match, pixels at most."""
+        options, longer = self.options, float(max(camera.size))
+        if box is not None:
+            longer = 2.0 * max(box[2] - box[0], box[3] - box[1])
+        return max(options.error_px, options.error * longer)
+
+    def _matches(self, alike: FArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Of the picture's and the mesh's features: each other's best, and clearly better than other places of the
+        mesh. alike: (P, N), cosines."""
+        best, back = alike.argmax(1), alike.argmax(0)
+        rows = np.flatnonzero((back[best] == np.arange(len(best))) & (alike.max(1) > 0))
+        points = self.features.points.astype(np.float32)
+        elsewhere = np.empty(len(rows), np.float32)
+        for k, row in enumerate(rows):
+            other = alike[row].copy()
+            other[((points - points[best[row]]) ** 2).sum(1) < (self.options.apart * self.model.diameter) ** 2] = -1.0
+            elsewhere[k] = other.max()
+        near = np.maximum(0, 1 - alike[rows, best[rows]])
+        rows = rows[near < self.options.ratio**2 * (1 - elsewhere)]
+        return rows, best[rows]
+
+    def _instance(
+        self, camera: Camera, seen: Keypoints, rows: NDArray[np.intp], columns: NDArray[np.intp], error: float
+    ) -> FeaturePose | None:
+        """The instance that most matches agree on; None where too few do."""
+        options, known = self.options, self.features
+        if len(rows) < options.least:
+            return None
+        points, pixels = known.points[columns], seen.pixels[rows]
+        pose = _robust_pose(points, pixels, camera, error, options.seed)
+        for _ in range(2):
+            if pose is None:
+                return None
+            borne = self._borne_out(camera, seen, rows, columns, pose, error)
+            if borne.sum() < options.least:
+                return None
+            ones = np.ones(int(borne.sum()))
+            pose = solve_pnp(
+                points[borne], pixels[borne], ones, ones, camera, pose, PnpConfig(min_points=options.least)
+            )
+        if pose is None or pose.t[2] < 0.5 * self.model.diameter:
+            return None
+        borne = self._borne_out(camera, seen, rows, columns, pose, error)
+        return self._judged(camera, pose, points, pixels, borne, error)
+
+    def _borne_out(
+        self,
+        camera: Camera,
+        seen: Keypoints,
+        rows: NDArray[np.intp],
+        columns: NDArray[np.intp],
+        T_cam_ctr: Pose,
+        error: float,
+    ) -> NDArray[np.bool_]:
+        """Which matches the pose explains: place, size, turn, and a side of the mesh that it shows."""
+        known = self.features
+        points = T_cam_ctr.apply(known.points[columns])
+        ends = T_cam_ctr.apply(known.points[columns] + known.tips[columns])
+        before = (points[:, 2] > 1e-3) & (ends[:, 2] > 1e-3)
+        points[~before, 2] = ends[~before, 2] = 1.0
+        at, tips = camera.project(points), camera.project(ends) - camera.project(points)
+        near = np.linalg.norm(at - seen.pixels[rows], axis=1) < error
+        length, wanted = np.linalg.norm(tips, axis=1), np.linalg.norm(seen.tips[rows], axis=1)
+        sized = np.abs(np.log((length + 1e-9) / wanted)) < np.log(self.options.size)
+        turned = (tips * seen.tips[rows]).sum(1) > np.cos(self.options.turn) * length * wanted
+        eye = -T_cam_ctr.R.T @ T_cam_ctr.t
+        shown = known.directions[columns] @ (eye / np.linalg.norm(eye)) > 0.3
+        return np.asarray(before & near & sized & turned & shown)
+
+    def _polished(self, camera: Camera, seen: Keypoints, alike: FArray, one: FeaturePose, error: float) -> FeaturePose:
+        """With all keypoints that the pose explains and that look alike, whether or not they look like others too."""
+        T_cam_ctr = one.T_cam_obj @ self.model.T_obj_ctr
+        inside = np.flatnonzero(self._inside(camera, one.T_cam_obj, seen.pixels))
+        pairs = np.argwhere(alike[inside] > ALIKE)
+        if not len(pairs):
+            return one
+        rows, columns = inside[pairs[:, 0]], pairs[:, 1]
+        borne = self._borne_out(camera, seen, rows, columns, T_cam_ctr, error)
+        rows, columns = rows[borne], columns[borne]
+        order = np.argsort(-alike[rows, columns], kind="stable")  # each keypoint's best only
+        first = order[np.unique(rows[order], return_index=True)[1]]
+        rows, columns = rows[first], columns[first]
+        if len(rows) < one.inliers:
+            return one
+        points, pixels = self.features.points[columns], seen.pixels[rows]
+        size = np.linalg.norm(seen.tips[rows], axis=1)  # a keypoint is placed as exactly as it is small
+        better = solve_pnp(points, pixels, np.ones(len(rows)), size / size.min(), camera, T_cam_ctr)
+        if better is None:
+            return one
+        T_cam_obj = better @ self.model.T_obj_ctr.inverse()
+        box = camera.points_box(T_cam_obj.apply(self.model.outline))
+        return replace(one, T_cam_obj=T_cam_obj, points=points + self.model.center, pixels=pixels, box=box)
+
+    def _judged(
+        self, camera: Camera, T_cam_ctr: Pose, points: Array, pixels: Array, borne: NDArray[np.bool_], error: float
+    ) -> FeaturePose | None:
+        """As the result where enough matches, spread over the mesh, bear it out."""
+        T_cam_obj = T_cam_ctr @ self.model.T_obj_ctr.inverse()
+        hull = self._hull(camera, T_cam_obj)
+        if hull is None or not borne.any():
+            return None
+        chosen = np.flatnonzero(borne)[_different(pixels[borne], error)]
+        rivals = _within(hull, pixels)
+        share = float(borne.sum() / max(1, (rivals | borne).sum()))
+        area = float(cv2.contourArea(cv2.convexHull(pixels[chosen].astype(np.float32)))) if len(chosen) > 2 else 0.0
+        spread = area / max(1.0, float(cv2.contourArea(hull)))
+        options = self.options
+        if len(chosen) < options.least or share < options.share or spread < options.spread:
+            return None
+        outline = T_cam_obj.apply(self.model.outline)
+        places = points[borne] + self.model.center
+        return FeaturePose(T_cam_obj, len(chosen), share, places, pixels[borne], camera.points_box(outline))
+
+    def _hull(self, camera: Camera, T_cam_obj: Pose) -> FArray | None:
+        """The projected mesh's convex hull (N, 1, 2); None where it reaches behind the camera."""
+        corners = T_cam_obj.apply(self.model.outline)
+        if corners[:, 2].min() < 1e-3:
+            return None
+        return np.asarray(cv2.convexHull(camera.project(corners).astype(np.float32)), np.float32)
+
+    def _inside(self, camera: Camera, T_cam_obj: Pose, pixels: Array) -> NDArray[np.bool_]:
+        hull = self._hull(camera, T_cam_obj)
+        return np.zeros(len(pixels), bool) if hull is None else _within(hull, pixels)
+
+
+# --- geometry ---------------------------------------------------------------------------------------------------
+
+
+def _robust_pose(points: Array, pixels: Array, camera: Camera, error: float, seed: int) -> Pose | None:
+    """``T_cam_ctr`` by OpenCV's USAC; the same for the same seed."""
+    params = cv2.UsacParams()
+    params.threshold, params.confidence, params.maxIterations = error, 0.9999, 10000
+    params.score, params.sampler = cv2.SCORE_METHOD_MAGSAC, cv2.SAMPLING_UNIFORM
+    params.loMethod, params.randomGeneratorState, params.isParallel = cv2.LOCAL_OPTIM_INNER_LO, seed, False
+    try:
+        fitted, _, turn, t, _ = cv2.solvePnPRansac(points, pixels, camera.K, None, params=params)
+    except cv2.error:  # its answer to degenerate matches
+        return None
+    if not fitted or not np.isfinite(turn).all() or not np.isfinite(t).all():
+        return None
+    return Pose(cv2.Rodrigues(turn)[0], t.ravel())
+
+
+def _within(hull: FArray, pixels: Array) -> NDArray[np.bool_]:
+    return np.array([cv2.pointPolygonTest(hull, (float(u), float(v)), False) >= 0 for u, v in pixels], bool)
+
+
+def _different(pixels: Array, apart: float) -> NDArray[np.intp]:
+    """Indices of one of the pixels in each cell of a grid: keypoints of one corner count once."""
+    return np.unique(np.floor(pixels / apart).astype(np.int64), axis=0, return_index=True)[1]
+
+
+# --- a picture's keypoints --------------------------------------------------------------------------------------
+
+
+_PICTURES: WeakKeyDictionary[View, Keypoints] = WeakKeyDictionary()
+
+
+def keypoints_of(view: View, box: Box | None = None) -> Keypoints:
+    """Of a photograph, or of a box (edges) in it. Those of the whole photograph are kept as long as the View is."""
+    if box is not None:
+        return _keypoints(view, box)
+    if view not in _PICTURES:
+        _PICTURES[view] = _keypoints(view, (0.0, 0.0, float(view.camera.width), float(view.camera.height)))
+    return _PICTURES[view]
+
+
+def _keypoints(view: View, box: Box) -> Keypoints:
+    whole = (box[2] - box[0], box[3] - box[1]) == view.camera.size
+    longer = max(box[2] - box[0], box[3] - box[1], 1.0)
+    (small, large), most = (PICTURE_SIDES, MOST_ENLARGED[0]) if whole else (BOX_SIDES, MOST_ENLARGED[1])
+    scale = min(max(small / longer, min(1.0, large / longer)), most)
+    x0, y0, x1, y1 = _region(view.camera, box, 1.0 if whole else BOX_MARGIN)
+    if x1 - x0 < 8 or y1 - y0 < 8:
+        return Keypoints(np.zeros((0, 128), np.float32), np.zeros((0, 2)), np.zeros((0, 2)))
+    size = round(scale * (x1 - x0)), round(scale * (y1 - y0))
+    part = view.image[y0:y1, x0:x1]
+    image = cv2.resize(part, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+    camera = view.camera.cropped(x0, y0, x1 - x0, y1 - y0).resized(*size)
+    at, tips, raw = _sift(image, OF_PICTURE)
+    pixels = view.camera.project(camera.backproject(at))
+    ends = view.camera.project(camera.backproject(at + tips))
+    return Keypoints(_root(raw), pixels, ends - pixels)
+
+
+def _region(camera: Camera, box: Box, enlarge: float) -> tuple[int, int, int, int]:
+    """A box enlarged, in whole pixels within the picture."""
+    middle, half = 0.5 * np.add(box[:2], box[2:]), 0.5 * enlarge * np.subtract(box[2:], box[:2])
+    low = np.clip(np.floor(middle - half), 0, camera.size).astype(int)
+    high = np.clip(np.ceil(middle + half), 0, camera.size).astype(int)
+    return int(low[0]), int(low[1]), int(high[0]), int(high[1])
+
+
+def _sift(image: NDArray[np.uint8], most: int) -> tuple[Array, Array, NDArray[np.uint8]]:
+    """Keypoints of an RGB picture: pixels (P, 2), tips (P, 2), descriptors (P, 128) as OpenCV has them."""
+    detector = cv2.SIFT_create(nfeatures=most, contrastThreshold=0.02, enable_precise_upscale=True)
+    found, raw = detector.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
+    if raw is None or not found:
+        return np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 128), np.uint8)
+    at = np.array([k.pt for k in found], np.float64)
+    turn = np.deg2rad([k.angle for k in found])
+    tips = np.array([k.size for k in found])[:, None] * np.stack([np.cos(turn), np.sin(turn)], 1)
+    return at, tips, np.clip(np.rint(raw), 0, 255).astype(np.uint8)
+
+
+def _root(raw: NDArray[np.uint8]) -> FArray:
+    """RootSIFT: unit vectors whose cosine is the histograms' Bhattacharyya coefficient."""
+    floats = raw.astype(np.float32)
+    return np.sqrt(floats / np.maximum(floats.sum(1, keepdims=True), 1.0))
+
+
+# --- a mesh's features ------------------------------------------------------------------------------------------
+
+_Made = tuple[NDArray[np.uint8], Array, Array, Array, bool]
+
+
+def _extracted(model: ObjectModel, renderer: Renderer) -> _Made:
+    """From 26 views spread evenly and the six sides."""
+    camera = Camera.from_fov(FIELD, SIDE, SIDE)
+    poses = centred_poses(model, [*view_rotations(26), *cube_views()], camera)
+    made, counts = [], []
+    for T_view_obj, view in zip(poses, renderer.render(model, poses, camera, light=Light.flat()), strict=True):
+        raw, *places = _of_view(view, T_view_obj @ model.T_obj_ctr)
+        made.append((raw, *places))
+        counts.append(len(raw))
+    raw, points, tips, directions = (np.concatenate(each) for each in zip(*made, strict=True))
+    return raw, points, tips, directions, bool(np.median(counts) < PLAIN_BELOW)
+
+
+def _of_view(view: View, T_view_ctr: Pose) -> tuple[NDArray[np.uint8], Array, Array, Array]:
+    assert view.mask is not None and view.depth is not None
+    if not view.mask.any():
+        return np.zeros((0, 128), np.uint8), *np.zeros((3, 0, 3))
+    image = view.image.copy()
+    image[~view.mask] = np.median(image[view.mask], axis=0)  # so that the outline is no strong edge of the texture
+    at, tips, raw = _sift(image, OF_VIEW)
+    whole = np.rint(at).astype(int).clip(0, SIDE - 1)
+    inside = cv2.distanceTransform(view.mask.astype(np.uint8), cv2.DIST_L2, 5)[whole[:, 1], whole[:, 0]]
+    kept = inside > np.maximum(1.5, 0.5 * np.linalg.norm(tips, axis=1))
+    at, tips, whole, raw = at[kept], tips[kept], whole[kept], raw[kept]
+    depth = view.depth[whole[:, 1], whole[:, 0]]
+    T_ctr_view = T_view_ctr.inverse()
+    points, ends = (T_ctr_view.apply(view.camera.backproject(p, depth)) for p in (at, at + tips))
+    eye = T_ctr_view.t / np.linalg.norm(T_ctr_view.t)
+    return raw, points, ends - points, np.broadcast_to(eye, points.shape)
+
+
+def _decoded(raw: NDArray[np.uint8], points: Array, tips: Array, directions: Array, plain: bool) -> FeatureModel:
+    return FeatureModel(_root(raw), points, tips, directions, plain)
+
+
+def cache_file(model: ObjectModel) -> Path:
+    """Where a mesh's features are kept: named by its shape, its colours or texture, and this module's version."""
+    look = hashlib.sha256(model.digest.encode())
+    for array in (model.colors, model.uvs, model.texture):
+        if array is not None:
+            look.update(str(array.shape).encode() + np.ascontiguousarray(array).tobytes())
+    return user_cache("features") / f"{model.digest}-{look.hexdigest()[:16]}-{VERSION}.npz"
+
+
+def _keep(path: Path, made: _Made) -> None:
+    """Written whole or not at all; the oldest files make room."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    raw, points, tips, directions, plain = made
+    buffer = io.BytesIO()
+    np.savez(buffer, raw=raw, points=points, tips=tips, directions=directions, plain=plain)
+    write_bytes_atomic(path, buffer.getvalue())
+    files = sorted(path.parent.glob("*.npz"), key=lambda p: p.stat().st_mtime)
+    for old in files[:-KEPT]:
+        old.unlink(missing_ok=True)
+
+
+def _read(path: Path) -> FeatureModel:
+    """Raises OSError, ValueError, KeyError or BadZipFile where there is none that can be used."""
+    with np.load(path, allow_pickle=False) as kept:
+        made = _decoded(kept["raw"], kept["points"], kept["tips"], kept["directions"], bool(kept["plain"]))
+    n = len(made.points)
+    if made.descriptors.shape != (n, 128) or {made.points.shape, made.tips.shape, made.directions.shape} != {(n, 3)}:
+        raise ValueError(f"{path} holds other arrays than features")
+    return made

@@ -1,0 +1,506 @@
+"""First poses: the template search, and MV-Net.
+
+The search renders the mesh from a few hundred directions once, and compares each template, turned in the picture
+plane, with the observed crop: how well the silhouettes agree, and how well the colours do once brightness and contrast
+are taken out. Nothing in it is learned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from posekit.camera import Box, Camera
+from posekit.errors import PromptError, WeightsError
+from posekit.first_pose.evidence import Palette, Picture, Silhouettes, Weights
+from posekit.geometry import (
+    Pose,
+    cube_views,
+    fibonacci_sphere,
+    quat_to_rotation,
+    rotation_between,
+    so3_exp,
+    view_rotation,
+)
+from posekit.mesh.model import ObjectModel
+from posekit.nets.inputs import to_input
+from posekit.nets.pose_delta import PoseDelta, apply_delta
+from posekit.nets.weights import Networks
+from posekit.render import Light, Renderer
+from posekit.results import Detection
+from posekit.view import View
+from posekit.zoom import box_window, frontal_camera, frontal_pose, zoom_to_box
+
+Array = NDArray[np.float64]
+FArray = NDArray[np.float32]
+
+TEMPLATE = 64  # side of the box search's templates, pixels
+JUDGED = 96  # side of the window in which poses are judged, pixels
+FINER = 2  # times as fine as it is compared, a crop is kept
+FLAT = 20.0  # a gradient below which brightness says little, in Sobel's units of 8 bits
+
+
+@dataclass(frozen=True)
+class TemplateOptions:
+    """views: directions over the sphere. turns: in-plane rotations. size: side of the compared patches in pixels.
+    colour: weight of the colour agreement against the silhouettes'. apart: least angle between two hypotheses."""
+
+    views: int = 200
+    turns: int = 24
+    size: int = 32
+    colour: float = 0.5
+    apart: float = float(np.deg2rad(20.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """T_cam_obj: a first pose. score: higher is better, comparable within one search only."""
+
+    T_cam_obj: Pose
+    score: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Patch:
+    """A silhouette fitted into a square: mask float32 (s, s); colour float32 (s, s, 3), zero mean and unit
+    variance inside the mask, zero outside. centre: (2,) the box's centre and half: half its longer side, in the
+    source picture's pixels."""
+
+    mask: FArray
+    colour: FArray
+    centre: Array
+    half: float
+
+
+def _patch(image: NDArray[np.uint8], mask: NDArray[np.uint8], size: int, turn: float = 0.0) -> _Patch | None:
+    """The masked object, turned by ``turn`` radians (clockwise in the picture), fitted into a square of ``size``."""
+    points = cv2.findNonZero(mask)
+    if points is None:
+        return None
+    uv = points.reshape(-1, 2).astype(np.float64)
+    c, s = np.cos(turn), np.sin(turn)
+    R = np.array([[c, -s], [s, c]])
+    turned = uv @ R.T
+    low, high = turned.min(0), turned.max(0)
+    half = 0.5 * float((high - low).max() + 1)
+    middle = 0.5 * (low + high)
+    scale = 0.5 * size / half
+    # from source pixels to patch pixels: turn, move the box's middle to the patch's, scale
+    M = np.zeros((2, 3))
+    M[:, :2] = scale * R
+    M[:, 2] = 0.5 * (size - 1) - scale * middle
+    flags = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    soft = cv2.warpAffine(mask.astype(np.float32), M, (size, size), flags=flags) > 0.5
+    colour = cv2.warpAffine(image, M, (size, size), flags=flags).astype(np.float32)
+    if soft.sum() < 8:
+        return None
+    inside = colour[soft]
+    colour = (colour - inside.mean(0)) / (inside.std() + 4.0)
+    colour[~soft] = 0
+    return _Patch(soft.astype(np.float32), colour, middle @ R, half)
+
+
+class TemplateSearch:
+    """First poses by comparison with rendered templates; the templates are made once per mesh."""
+
+    def __init__(self, model: ObjectModel, renderer: Renderer, options: TemplateOptions = TemplateOptions()) -> None:
+        self.model, self.options = model, options
+        self.rotations = [view_rotation(d) for d in fibonacci_sphere(options.views)]
+        side = 64
+        self.distance = 4.0 * model.diameter
+        focal = 0.9 * side * self.distance / model.diameter
+        self.camera = Camera(focal, focal, 0.5 * side - 0.5, 0.5 * side - 0.5, side, side)
+        T_ctr_obj = model.T_obj_ctr.inverse()
+        poses = [Pose(R, np.array([0, 0, self.distance])) @ T_ctr_obj for R in self.rotations]
+        views = renderer.render(model, poses, self.camera, light=Light(), coords=False)
+        found = [_patch(v.image, _u8(v.mask), options.size) for v in views]
+        self.kept = [k for k, patch in enumerate(found) if patch is not None]
+        self.patches = [patch for patch in found if patch is not None]
+        if not self.patches:
+            raise PromptError(f"{model.name} leaves no silhouette from any side: its surface is too thin to search.")
+        self.masks = np.stack([p.mask.ravel() for p in self.patches])
+        self.colours = np.stack([p.colour.ravel() for p in self.patches])
+
+    def search(self, view: View, detection: Detection, count: int) -> list[Hypothesis]:
+        """The best ``count`` first poses for a detection, best first, none nearer to another than ``apart``.
+
+        view: the photograph. detection: its box and, better, its mask; without a mask the filled box is compared.
+        """
+        zoom = zoom_to_box(view.camera, detection.box, (128, 128), enlarge=1.15)
+        mask = detection.mask if detection.mask is not None else box_mask(detection.box, view.camera)
+        crop = view.with_mask(mask).zoomed(zoom)
+        if crop.mask is None or not crop.mask.any():
+            return []
+        turns = np.arange(self.options.turns) * (2 * np.pi / self.options.turns)
+        patches = [_patch(crop.image, _u8(crop.mask), self.options.size, turn) for turn in turns]
+        usable = [(turn, patch) for turn, patch in zip(turns, patches, strict=True) if patch is not None]
+        if not usable:
+            return []
+        scores = self._scores([patch for _, patch in usable])  # (turns, templates)
+        found: list[Hypothesis] = []
+        for flat in np.argsort(-scores, axis=None):
+            row, column = np.unravel_index(flat, scores.shape)
+            turn, patch = usable[int(row)]
+            pose = self._pose(crop, turn, patch, int(column))
+            if _is_apart(pose, found, self.model, self.options.apart):
+                found.append(Hypothesis(pose, float(scores[row, column])))
+            if len(found) == count:
+                break
+        return found
+
+    def _scores(self, observed: Sequence[_Patch]) -> Array:
+        masks = np.stack([p.mask.ravel() for p in observed])
+        colours = np.stack([p.colour.ravel() for p in observed])
+        both = masks @ self.masks.T
+        union = masks.sum(1)[:, None] + self.masks.sum(1)[None] - both
+        agreement = colours @ self.colours.T / (3 * np.maximum(both, 1.0))
+        return (both / union + self.options.colour * np.clip(agreement, -1, 1)).astype(np.float64)
+
+    def _pose(self, crop: View, turn: float, patch: _Patch, column: int) -> Pose:
+        """The template's pose turned back, at the depth and place that the two boxes give (in the photograph)."""
+        template = self.patches[column]
+        # the observed crop was turned by ``turn`` to look like the template: the object is turned by -turn
+        R_turn = so3_exp([0.0, 0.0, -turn])
+        R = R_turn @ self.rotations[self.kept[column]]
+        size_here = patch.half / crop.camera.fx
+        size_there = template.half / self.camera.fx
+        depth = self.distance * size_there / size_here
+        # the object's centre lies beside its box's centre by this much of the box
+        offset = (np.array([self.camera.cx, self.camera.cy]) - template.centre) / template.half * patch.half
+        pixel = patch.centre + R_turn[:2, :2] @ offset
+        T_view_ctr = Pose(R, crop.camera.backproject(pixel, depth))
+        ray_turn = rotation_between([0.0, 0.0, 1.0], T_view_ctr.t)
+        T_view_ctr = Pose(ray_turn @ T_view_ctr.R, T_view_ctr.t)  # seen along this ray it looks as the template does
+        return Pose.rotation(crop.R_view_cam.T) @ T_view_ctr @ self.model.T_obj_ctr.inverse()
+
+
+@dataclass(frozen=True)
+class BoxOptions:
+    """views: directions over the sphere. turns: in-plane rotations, a multiple of 4. side: of the compared pictures,
+    pixels; root: square root of the box's area in them. aspect: factor by which a silhouette's aspect may differ from
+    the box's. tried: silhouettes that are moved. apart: least angle between two hypotheses. weights: of the evidence.
+    """
+
+    views: int = 200
+    turns: int = 24
+    side: int = 48
+    root: float = 26.0
+    aspect: float = 1.42
+    tried: int = 64
+    apart: float = float(np.deg2rad(20.0))
+    weights: Weights = Weights()
+
+
+@dataclass(frozen=True)
+class _Move:
+    """Of a silhouette in its picture: pixels to the side, a factor of its size, a turn (radians)."""
+
+    x: float = 0.0
+    y: float = 0.0
+    scale: float = 1.0
+    turn: float = 0.0
+
+    def matrix(self, side: int) -> Array:
+        """(2, 3), of the picture's pixels, about its middle."""
+        c, s = self.scale * np.cos(self.turn), self.scale * np.sin(self.turn)
+        R, middle = np.array([[c, -s], [s, c]]), np.full(2, 0.5 * side - 0.5)
+        return np.column_stack([R, middle + (self.x, self.y) - R @ middle])
+
+
+@dataclass(frozen=True, eq=False)
+class _Placed:
+    """How a template lies in the compared picture. view: its number. turn: in the picture's plane, radians. aspect: its
+    box's width over height. scale: from the template's pixels. offset: (2,), from its box's middle to the object's
+    centre, pixels."""
+
+    view: int
+    turn: float
+    aspect: float
+    scale: float
+    offset: Array
+
+    def turned(self) -> _Placed:
+        """By a quarter turn clockwise."""
+        offset = np.array([-self.offset[1], self.offset[0]])
+        return _Placed(self.view, self.turn + 0.5 * np.pi, 1 / self.aspect, self.scale, offset)
+
+
+MOVES = tuple(
+    _Move(x, y, scale, turn)
+    for x in (-1.5, 0.0, 1.5)
+    for y in (-1.5, 0.0, 1.5)
+    for scale in (0.94, 1.0, 1.06)
+    for turn in (-np.pi / 36, 0.0, np.pi / 36)
+)
+
+
+class BoxSearch:
+    """First poses from a box alone: every template's silhouette, laid into the box, is tried as the object's mask.
+
+    The templates are made once per mesh, all with the same area of their boxes; a photograph is zoomed so that the box
+    has that area. Evidence of colours and edges says which silhouette the picture shows
+    (`posekit.first_pose.evidence`); the best ones are then moved, scaled and turned a little.
+    """
+
+    def __init__(self, model: ObjectModel, renderer: Renderer, options: BoxOptions = BoxOptions()) -> None:
+        """Raises PromptError where the mesh leaves no silhouette."""
+        self.model, self.options, self.weights = model, options, weights_for(model, options.weights)
+        self.rotations = [view_rotation(d) for d in fibonacci_sphere(options.views)]
+        self.distance = 4.0 * model.diameter
+        focal = 0.9 * TEMPLATE * self.distance / model.diameter
+        self.camera = Camera(focal, focal, 0.5 * TEMPLATE - 0.5, 0.5 * TEMPLATE - 0.5, TEMPLATE, TEMPLATE)
+        poses = [Pose(R, np.array([0, 0, self.distance])) @ model.T_obj_ctr.inverse() for R in self.rotations]
+        views = renderer.render(model, poses, self.camera, light=Light(), coords=False)
+        turns = np.arange(options.turns // 4) * (2 * np.pi / options.turns)
+        found = [self._place(k, view, turn) for k, view in enumerate(views) for turn in turns]
+        usable = [each for each in found if each is not None]
+        if not usable:
+            raise PromptError(f"{model.name} leaves no silhouette from any side: its surface is too thin to search.")
+        self.placed = [placed for placed, _, _ in usable]
+        quarters = [Silhouettes.of([mask for _, mask, _ in usable], [image for _, _, image in usable])]
+        for _ in range(3):
+            quarters.append(quarters[-1].turned())
+            self.placed += [placed.turned() for placed in self.placed[-len(usable) :]]
+        self.silhouettes = Silhouettes.joined(quarters)
+        self.aspects = np.array([placed.aspect for placed in self.placed])
+
+    def search(self, view: View, detection: Detection, count: int) -> list[Hypothesis]:
+        """The best ``count`` first poses for a detection, best first, none nearer to another than ``apart``.
+
+        view: the photograph. detection: its box; where it has a mask, its overlap with the silhouette counts too.
+        """
+        zoom = box_window(view.camera, detection.box, FINER * self.options.side, self.options.root / self.options.side)
+        masked = view.with_mask(detection.mask)
+        crop = masked.zoomed(zoom)
+        shown = crop.shown
+        if not shown.any() or (detection.mask is not None and (crop.mask is None or not crop.mask.any())):
+            return []
+        palette = Palette(crop.image, shown)
+        box = view.camera.box_corner_rays(detection.box) @ zoom.R_view_cam.T
+        size = np.ptp(box[:, :2] / box[:, 2:], axis=0)
+        different = np.abs(np.log(self.aspects * size[1] / size[0]))
+        rows = np.flatnonzero(different < max(np.log(self.options.aspect), different.min() + 1e-6))
+        found = self.silhouettes.chosen(rows)
+        scores = found.scores(self._picture(crop, shown, palette, _Move()), self.weights)
+        best = rows[np.argsort(-scores, kind="stable")[: self.options.tried]]
+        moves, scores = self._moved(crop, shown, palette, best)
+        return self._apart(crop, best, moves, scores, count)
+
+    def _apart(
+        self, crop: View, rows: NDArray[np.intp], moves: Sequence[_Move], scores: FArray, count: int
+    ) -> list[Hypothesis]:
+        found: list[Hypothesis] = []
+        for k in np.argsort(-scores, kind="stable"):
+            pose = self._pose(crop, self.placed[rows[k]], moves[k])
+            if _is_apart(pose, found, self.model, self.options.apart):
+                found.append(Hypothesis(pose, float(scores[k])))
+            if len(found) == count:
+                break
+        return found
+
+    def _moved(
+        self, crop: View, shown: NDArray[np.bool_], palette: Palette, rows: NDArray[np.intp]
+    ) -> tuple[list[_Move], FArray]:
+        """The best of MOVES for each of some silhouettes, and its score."""
+        some = self.silhouettes.chosen(rows)
+        tried = [some.scores(self._picture(crop, shown, palette, move), self.weights) for move in MOVES]
+        table = np.stack(tried)
+        best = table.argmax(0)
+        return [MOVES[k] for k in best], np.asarray(table.max(0), np.float32)
+
+    def _picture(self, crop: View, shown: NDArray[np.bool_], palette: Palette, move: _Move) -> Picture:
+        """The crop as a silhouette that is moved so sees it. crop: FINER times as fine."""
+        side = self.options.side
+        M = np.zeros((2, 3))
+        there = move.matrix(side)
+        M[:, :2], M[:, 2] = FINER * there[:, :2], FINER * (there[:, 2] + 0.5) - 0.5
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        image = cv2.warpAffine(crop.image, M, (side, side), flags=flags, borderMode=cv2.BORDER_REPLICATE)
+        on, mask = (
+            None if each is None else cv2.warpAffine(each.astype(np.float32), M, (side, side), flags=flags) > 0.5
+            for each in (shown, crop.mask)
+        )
+        assert on is not None
+        return Picture.of(image, on, palette, mask)
+
+    def _place(
+        self, number: int, view: View, turn: float
+    ) -> tuple[_Placed, NDArray[np.bool_], NDArray[np.uint8]] | None:
+        """A template turned and scaled to the compared picture: how it lies, its mask (H, W) and RGB (H, W, 3)."""
+        side = self.options.side
+        points = cv2.findNonZero(_u8(view.mask))
+        if points is None:
+            return None
+        c, s = np.cos(turn), np.sin(turn)
+        R = np.array([[c, -s], [s, c]])
+        turned = points.reshape(-1, 2) @ R.T
+        low, high = turned.min(0), turned.max(0)
+        width, height = high - low + 1
+        scale = float(self.options.root / np.sqrt(width * height))
+        M = np.column_stack([scale * R, 0.5 * side - 0.5 - scale * 0.5 * (low + high)])
+        mask = cv2.warpAffine(_u8(view.mask).astype(np.float32), M, (side, side), flags=cv2.INTER_LINEAR) > 0.5
+        if mask.sum() < 8:
+            return None
+        image = cv2.warpAffine(view.image, M, (side, side), flags=cv2.INTER_LINEAR)
+        offset = scale * (R @ (self.camera.cx, self.camera.cy) - 0.5 * (low + high))
+        return _Placed(number, turn, float(width / height), scale, offset), mask, np.asarray(image, np.uint8)
+
+    def _pose(self, crop: View, placed: _Placed, move: _Move) -> Pose:
+        """The template's pose at the place and depth where its silhouette was laid (in the photograph)."""
+        side = self.options.side
+        camera = crop.camera.resized(side, side)
+        M = move.matrix(side)
+        pixel = M[:, :2] @ (placed.offset + (0.5 * side - 0.5)) + M[:, 2]
+        depth = self.distance * camera.fx / (placed.scale * move.scale * self.camera.fx)
+        R = so3_exp([0.0, 0.0, placed.turn + move.turn]) @ self.rotations[placed.view]
+        t = camera.backproject(pixel, depth)
+        T_view_ctr = Pose(rotation_between([0.0, 0.0, 1.0], t) @ R, t)  # along this ray it looks as the template does
+        return Pose.rotation(crop.R_view_cam.T) @ T_view_ctr @ self.model.T_obj_ctr.inverse()
+
+
+class Judge:
+    """Evidence for rendered poses in one window of a photograph, so that poses can be compared with each other."""
+
+    def __init__(self, view: View, box: Box, model: ObjectModel, renderer: Renderer, weights: Weights = Weights()):
+        """view: the photograph; its mask, where there is one, counts too. box: edges, round what the poses show."""
+        self.model, self.renderer, self.weights = model, renderer, weights_for(model, weights)
+        self.zoom = box_window(view.camera, box, JUDGED, BoxOptions.root / BoxOptions.side)
+        crop = view.zoomed(self.zoom)
+        shown = crop.shown
+        self.picture = Picture.of(crop.image, shown, Palette(crop.image, shown), crop.mask) if shown.any() else None
+
+    def scores(self, poses: Sequence[Pose]) -> list[float]:
+        """Of each ``T_cam_obj``, as `Silhouettes.scores`; 0 for one that shows nothing in the window."""
+        if self.picture is None or not poses:
+            return [0.0] * len(poses)
+        turned = [Pose.rotation(self.zoom.R_view_cam) @ pose for pose in poses]
+        drawn = self.renderer.render(self.model, turned, self.zoom.camera, coords=False)
+        masks = [np.asarray(each.mask, np.bool_) for each in drawn]
+        scores = Silhouettes.of(masks, [each.image for each in drawn]).scores(self.picture, self.weights)
+        return [float(score) if mask.any() else 0.0 for score, mask in zip(scores, masks, strict=True)]
+
+
+class MVNetSearch:
+    """The paper's first pose: MV-Net compares the crop with the six views of a cube's faces (section 3.2).
+
+    The views are rendered once per mesh, each as a crop round its own box would show it. The answer is relative to
+    the frontal view, placed at the detection box's centre, at the depth at which it looks as large in the crop as it
+    was rendered: so the box's size gives the first depth.
+    """
+
+    def __init__(self, model: ObjectModel, networks: Networks, renderer: Renderer) -> None:
+        if networks.mvnet is None:
+            raise WeightsError(
+                f"the {networks.preset} weights {networks.digest} hold no trained MV-Net: use --init templates."
+            )
+        self.model, self.size, self.mvnet = model, networks.size, networks.mvnet
+        self.rotations = cube_views()
+        self.camera, self.distance = frontal_camera(model, networks.size)
+        poses = [Pose(R, np.array([0, 0, self.distance])) @ model.T_obj_ctr.inverse() for R in self.rotations]
+        views = renderer.render(model, poses, self.camera, coords=False)
+        self.device = networks.device
+        self.views = torch.from_numpy(np.stack([to_input(v.image, v.mask) for v in views])).to(self.device)
+
+    def search(self, view: View, detection: Detection, count: int) -> list[Hypothesis]:
+        """One first pose; ``count`` is an upper bound, as for every search. Empty where it lies behind the camera."""
+        mask = detection.mask if detection.mask is not None else box_mask(detection.box, view.camera)
+        crop = view.with_mask(mask).zoomed(zoom_to_box(view.camera, detection.box, self.size))
+        observed = torch.from_numpy(to_input(crop.image, crop.mask))[None].to(self.device)
+        with torch.inference_mode():
+            out = self.mvnet(observed, self.views[None])
+        quat_wxyz, v = (x[0].double().cpu().numpy() for x in (out.quat_wxyz, out.v))
+        delta = PoseDelta(quat_to_rotation(quat_wxyz), v)
+        target = apply_delta(self.frontal(crop.camera), delta, crop.camera.fx)
+        if not np.isfinite(target.matrix).all() or target.t[2] < 0.6 * self.model.diameter:
+            return []
+        T_cam_view = Pose.rotation(crop.R_view_cam.T)
+        return [Hypothesis(T_cam_view @ target @ self.model.T_obj_ctr.inverse(), 1.0)][:count]
+
+    def frontal(self, crop_camera: Camera) -> Pose:
+        """The ``T_view_ctr`` to which MV-Net's answer is relative."""
+        return frontal_pose(self.camera, self.distance, crop_camera)
+
+
+def _is_apart(pose: Pose, found: Sequence[Hypothesis], model: ObjectModel, angle: float) -> bool:
+    """Whether a ``T_cam_obj`` is further than ``angle`` from all that were found, and from all that look the same."""
+    if not found:
+        return True
+    return bool((model.symmetries.angles(pose.R, np.stack([h.T_cam_obj.R for h in found])) > angle).all())
+
+
+def poses_beside(T_cam_obj: Pose, model: ObjectModel, angle: float) -> list[Pose]:
+    """The pose turned by ``angle`` (radians) about the object's centre, towards each corner of a tetrahedron."""
+    T_cam_ctr = T_cam_obj @ model.T_obj_ctr
+    corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3)
+    turned = [Pose(so3_exp(angle * corner) @ T_cam_ctr.R, T_cam_ctr.t) for corner in corners]
+    return [T @ model.T_obj_ctr.inverse() for T in turned]
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How well a pose explains a photograph, measured by rendering it there.
+
+    silhouette: intersection over union with the observed mask, 1 where there is none. colour: correlation of the
+    rendered and the observed colours inside the silhouette, brightness and contrast taken out, -1 to 1. structure: how
+    alike the two brightness gradients are inside the silhouette, -1 to 1, flat places counting little.
+    """
+
+    silhouette: float
+    colour: float
+    structure: float = 0.0
+
+
+def agreement_of(observed: View, rendered: View) -> Agreement:
+    """Of a photograph's crop and the object drawn for the same camera."""
+    assert rendered.mask is not None
+    structure = _structure(observed, rendered)
+    inside, silhouette = rendered.mask, 1.0
+    if observed.mask is not None:
+        silhouette = float((inside & observed.mask).sum() / max(1, (inside | observed.mask).sum()))
+        inside = inside & observed.mask
+    if inside.sum() < 30:
+        return Agreement(silhouette, -1.0, structure)
+    a, b = (v.image[inside].astype(np.float64) for v in (observed, rendered))
+    a, b = a - a.mean(0), b - b.mean(0)
+    colour = float((a * b).sum() / (np.linalg.norm(a) * np.linalg.norm(b) + 1e-9))
+    return Agreement(silhouette, colour, structure)
+
+
+def _structure(observed: View, rendered: View) -> float:
+    assert rendered.mask is not None
+    inside = cv2.erode(rendered.mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    if not inside.any():
+        return 0.0
+    a, b = _gradients(observed.image)[inside], _gradients(rendered.image)[inside]
+    lengths = (np.linalg.norm(a, axis=1) + FLAT) * (np.linalg.norm(b, axis=1) + FLAT)
+    return float(((a * b).sum(axis=1) / lengths).mean())
+
+
+def _gradients(image: NDArray[np.uint8]) -> FArray:
+    """Sobel's, of the slightly blurred brightness, (H, W, 2)."""
+    grey = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1.0)
+    return np.dstack([cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)])
+
+
+def weights_for(model: ObjectModel, weights: Weights) -> Weights:
+    """Without the colour agreement for a mesh without colours: its shading depends on a light that nobody knows."""
+    plain = model.colors is None and model.texture is None
+    return replace(weights, agreement=0.0) if plain else weights
+
+
+def box_mask(box: tuple[float, float, float, float], camera: Camera) -> NDArray[np.bool_]:
+    """The filled box as a mask (H, W)."""
+    mask = np.zeros((camera.height, camera.width), bool)
+    x0, y0, x1, y1 = (round(v) for v in box)
+    mask[max(0, y0) : max(0, y1), max(0, x0) : max(0, x1)] = True
+    return mask
+
+
+def _u8(mask: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
+    assert mask is not None
+    return mask.astype(np.uint8)

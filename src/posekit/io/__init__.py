@@ -1,0 +1,1 @@
+"""Photographs, videos, cameras, masks and poses from and to files."""

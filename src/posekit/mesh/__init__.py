@@ -1,0 +1,1 @@
+"""Meshes: files read into metres, one texture, normals, symmetries."""

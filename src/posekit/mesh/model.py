@@ -1,0 +1,210 @@
+"""ObjectModel: a mesh in metres, with its symmetries."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+
+import fast_simplification
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.distance import pdist
+
+from posekit.errors import MeshError
+from posekit.geometry import Pose, fibonacci_sphere
+from posekit.mesh.atlas import merge
+from posekit.mesh.processing import (
+    carried_uvs,
+    checked_mesh,
+    coincident,
+    face_areas,
+    hull_vertices,
+    mean_colors,
+    repaired_normals,
+    smooth_normals,
+    used_vertices,
+    vertex_rows,
+)
+from posekit.mesh.reading import read_parts
+from posekit.mesh.symmetries import Symmetries, symmetries_of
+from posekit.mesh.units import UNITS, chosen_units
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectModel:
+    """A mesh in metres with its own axes and origin. Make one with `load` or `from_arrays`, which check it.
+
+    vertices: float32 (V, 3). faces: int32 (F, 3). normals: float32 (V, 3), unit.
+    colors: uint8 (V, 3) or None. uvs: float32 (V, 2) or None, v up as in OpenGL and OBJ.
+    texture: uint8 RGB (H, W, 3) or None; where it is set, uvs is too and colors is None.
+    units: those of the file it came from, "mm", "cm", "m" or "in".
+    """
+
+    name: str
+    vertices: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    normals: NDArray[np.float32]
+    colors: NDArray[np.uint8] | None = None
+    uvs: NDArray[np.float32] | None = None
+    texture: NDArray[np.uint8] | None = None
+    symmetries: Symmetries = field(default_factory=Symmetries.none)
+    units: str = "m"
+
+    @cached_property
+    def digest(self) -> str:
+        """16 hex digits of the shape (vertices to 0.01 mm and faces): what weights name the meshes by that they saw."""
+        shape = hashlib.sha256(np.rint(self.vertices * 1e5).astype("<i4").tobytes())
+        shape.update(self.faces.astype("<i4").tobytes())
+        return shape.hexdigest()[:16]
+
+    @classmethod
+    def load(cls, path: str | Path, units: str = "auto", symmetry: str | Symmetries | None = None) -> ObjectModel:
+        """Read a PLY, OBJ (with MTL and textures), GLB, glTF or STL file.
+
+        units: "mm", "cm", "m", "in" (inches), or "auto": metres where the diameter is below 3, millimetres where it is
+        above 20; what is taken is said, with the object's length.
+        symmetry: a text for `Symmetries.parse`, a JSON file's name, or symmetries; otherwise they are read from a
+        ``models_info.json`` beside the mesh (``obj_000009.ply`` by its number, other names by their stem).
+
+        The parts of a GLB or OBJ become one mesh, in the scene's places; several textures become one. Normals are
+        the file's, else `smooth_normals`. A GLB's colours are taken as sRGB.
+        Raises MeshError where the file is no usable mesh, lacks a texture, or has an implausible size.
+        """
+        path = Path(path)
+        if units not in ("auto", *UNITS):
+            raise MeshError(f"units are auto, {', '.join(UNITS)}, not {units!r}.")
+        merged = merge(read_parts(path), path.name)
+        model = cls.from_arrays(
+            merged.vertices,
+            merged.faces,
+            name=path.stem,
+            colors=merged.colors,
+            uvs=merged.uvs,
+            texture=merged.texture,
+            normals=merged.normals,
+            label=path.name,
+        )
+        units = chosen_units(path.name, model.diameter, units)
+        scaled = (model.vertices * np.float64(UNITS[units])).astype(np.float32)
+        model = replace(model, vertices=scaled, units=units)
+        return replace(model, symmetries=symmetries_of(symmetry, path, model.center))
+
+    @classmethod
+    def from_arrays(
+        cls,
+        vertices: ArrayLike,
+        faces: ArrayLike,
+        *,
+        name: str = "object",
+        colors: ArrayLike | None = None,
+        uvs: ArrayLike | None = None,
+        texture: NDArray[np.uint8] | None = None,
+        normals: ArrayLike | None = None,
+        symmetries: Symmetries | None = None,
+        label: str | None = None,
+    ) -> ObjectModel:
+        """A model from vertices (V, 3) in metres and faces (F, 3).
+
+        colors: (V, 3) uint8; uvs: (V, 2) with texture: uint8 (H, W, 3); normals: (V, 3), `smooth_normals` where
+        not given. Faces without area and vertices without faces are dropped. label: the mesh's name in messages.
+        Raises MeshError where it is not a usable mesh.
+        """
+        label = label or name
+        v, f = checked_mesh(label, np.asarray(vertices), np.asarray(faces))
+        f = f[face_areas(v, f) > 1e-14 * float(np.ptp(v, axis=0).max()) ** 2]
+        if len(f) < 2:
+            raise MeshError(
+                f"{label} has {len(f) or 'no'} face{'s' if len(f) != 1 else ''} with an area: an object needs at "
+                "least two. Export it as a triangle mesh."
+            )
+        if (texture is None) != (uvs is None):
+            texture = uvs = None  # either is useless without the other
+        if normals is None:
+            source, f, unit = smooth_normals(v, f)
+        else:
+            source, f = used_vertices(f, len(v))
+            unit = repaired_normals(np.asarray(normals, dtype=np.float64)[source], v[source], f)
+        rgb = (
+            None if colors is None or texture is not None else vertex_rows(label, "colors", colors, len(v))[source, :3]
+        )
+        uv = None if uvs is None else vertex_rows(label, "uvs", uvs, len(v))[source, :2]
+        return cls(
+            name=name,
+            vertices=v[source].astype(np.float32),
+            faces=f.astype(np.int32),
+            normals=unit.astype(np.float32),
+            colors=None if rgb is None else rgb.astype(np.uint8),
+            uvs=None if uv is None else uv.astype(np.float32),
+            texture=None if texture is None else np.ascontiguousarray(texture, dtype=np.uint8),
+            symmetries=symmetries or Symmetries.none(),
+        )
+
+    @cached_property
+    def bounds(self) -> Floats:
+        """(2, 3), the bounding box's lower and upper corner in ``obj``."""
+        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)]).astype(np.float64)
+
+    @cached_property
+    def center(self) -> Floats:
+        """(3,), the bounding box's centre in ``obj``."""
+        return np.asarray(self.bounds.mean(axis=0))
+
+    @cached_property
+    def extents(self) -> Floats:
+        """(3,), the bounding box's sides."""
+        return np.asarray(self.bounds[1] - self.bounds[0])
+
+    @cached_property
+    def outline(self) -> Floats:
+        """(N, 3), the corners of the convex hull in ``obj``: all that decides which box the object fills."""
+        return hull_vertices(self.vertices.astype(np.float64))
+
+    @cached_property
+    def diameter(self) -> float:
+        """The largest distance of two vertices; within 0.1 % of it where the hull has thousands of corners."""
+        points = self.outline
+        if len(points) > 4000:
+            points = points[np.unique((points @ fibonacci_sphere(4000).T).argmax(axis=0))]
+        return float(pdist(points).max())
+
+    @cached_property
+    def T_obj_ctr(self) -> Pose:
+        return Pose.translation(self.center)
+
+    def simplified(self, faces: int) -> ObjectModel:
+        """The same object with about so many faces, to be drawn small and often; itself where it has no more.
+
+        Its shape errs least for its number of faces (quadric error metrics: Garland and Heckbert, 1997). Colours are
+        means of those near by; a face's place in the texture is that of the face that lay at its middle.
+        """
+        if len(self.faces) <= faces:
+            return self
+        places = coincident(self.vertices.astype(np.float64))
+        _, first, welded = np.unique(places, return_index=True, return_inverse=True)
+        vertices, kept = fast_simplification.simplify(
+            self.vertices[first], welded[self.faces].astype(np.int32), target_count=faces
+        )
+        colors = uvs = None
+        if self.colors is not None:
+            colors = mean_colors(vertices, self.vertices, self.colors)
+        if self.uvs is not None:
+            source, kept, uvs = carried_uvs(vertices, kept, self.vertices[self.faces], self.uvs[self.faces])
+            vertices = vertices[source]
+        model = ObjectModel.from_arrays(
+            vertices, kept, name=self.name, colors=colors, uvs=uvs, texture=self.texture, symmetries=self.symmetries
+        )
+        return replace(model, units=self.units)
+
+    def sample_points(self, n: int, seed: int = 0) -> Floats:
+        """(n, 3) points spread evenly over the surface, in ``obj``. The same seed gives the same points."""
+        rng = np.random.default_rng(seed)
+        corners = self.vertices.astype(np.float64)[self.faces]
+        share = np.cumsum(face_areas(self.vertices.astype(np.float64), self.faces))
+        chosen = corners[np.searchsorted(share, rng.random(n) * share[-1]).clip(max=len(share) - 1)]
+        a, b = rng.random((2, n, 1))
+        root = np.sqrt(a)
+        return np.asarray((1 - root) * chosen[:, 0] + root * (1 - b) * chosen[:, 1] + root * b * chosen[:, 2])

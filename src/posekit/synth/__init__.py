@@ -1,0 +1,1 @@
+"""Synthetic data sets in BOP layout: domain-randomised, photorealistic, scenes and sequences."""

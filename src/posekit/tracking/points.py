@@ -1,0 +1,166 @@
+"""Points that are followed, from one frame to the next and from the drawn mesh to the frame.
+
+Corners of the last frame that lie on the object are followed into the next one (Lucas and Kanade, forwards and
+backwards). It needs no mask of the new frame, and it drifts. Corners of the mesh as it is drawn, followed into the
+frame, do not drift; they need a texture that the mesh has too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from posekit.align.colour_edge import Outline, find_outline
+from posekit.align.fusion import Points
+from posekit.camera import Zoom
+from posekit.geometry import Pose
+from posekit.mesh.model import ObjectModel
+from posekit.view import View
+
+WINDOW, LEVELS = (13, 13), 3
+CORNERS, QUALITY, APART = 200, 0.005, 3  # at most; of the best one; pixels between two
+AGAIN = 0.7  # pixels from where it started that a point followed forwards and backwards may end
+LEAST = 6  # points
+SIGMA, TOGETHER = 0.5, 3.0  # pixels, expected error of a followed point; so many err alike
+# the same where the mesh's drawing is matched with the frame; and how far off a match may be, pixels
+TEXTURE_QUALITY, TEXTURE_SIGMA, TEXTURE_TOGETHER, FARTHEST = 0.02, 1.0, 0.7, 5.0
+ALIKE = (0.5, 0.8)  # correlations of patches from which on a match counts, and counts wholly
+PATCH, ROUND, FAINT = 9, 4.0, 4.0  # pixels; pixels; grey values below which contrast is noise
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """A frame's crop round the object, and the mesh drawn there.
+
+    seen: what the frame shows. drawn: with image, mask and coords, at ``T_view_ctr``. visible: (H, W), where the crop
+    shows the object rather than something before it.
+    """
+
+    seen: View
+    drawn: View
+    T_view_ctr: Pose
+    visible: NDArray[np.bool_]
+
+    @cached_property
+    def grey(self) -> NDArray[np.uint8]:
+        """What the frame shows (H, W)."""
+        return np.asarray(cv2.cvtColor(self.seen.image, cv2.COLOR_RGB2GRAY))
+
+    @cached_property
+    def corners(self) -> NDArray[np.float32]:
+        """Pixels (N, 1, 2) of the object that can be followed into the next frame."""
+        assert self.drawn.mask is not None
+        solid = self.drawn.mask & self.visible & self.seen.shown
+        inside = cv2.erode(solid.astype(np.uint8), np.ones((5, 5), np.uint8))
+        corners = cv2.goodFeaturesToTrack(self.grey, CORNERS, QUALITY, APART, mask=inside)
+        return np.zeros((0, 1, 2), np.float32) if corners is None else np.asarray(corners, np.float32)
+
+    @cached_property
+    def outline(self) -> Outline:
+        """Of the drawn mesh."""
+        assert self.drawn.mask is not None
+        return find_outline(self.drawn.mask)
+
+    def prepare(self) -> None:
+        """Find now what the next frame is going to need."""
+        self.corners, self.outline  # noqa: B018 - they keep what they find
+
+    def again(self, view: View) -> View:
+        """The same crop of the next frame."""
+        return view.zoomed(Zoom(view.camera, self.seen.camera, self.seen.R_view_cam))
+
+
+def follow_points(before: Look, pose: Pose, after: View, model: ObjectModel) -> Points | None:
+    """Points of the object, and where they are in the next frame.
+
+    before: the last frame's crop; pose: ``T_view_ctr`` in it, near the one at which it was drawn. after: the same crop
+    of the next frame. None where too few can be followed.
+    """
+    drawn, camera, corners = before.drawn, before.drawn.camera, before.corners
+    assert drawn.mask is not None and drawn.coords is not None
+    second = cv2.cvtColor(after.image, cv2.COLOR_RGB2GRAY)
+    shown = cv2.erode(after.shown.astype(np.uint8), np.ones((5, 5), np.uint8))
+    corners = corners[shown[tuple(corners[:, 0].astype(int).T[::-1])] > 0]
+    if len(corners) < LEAST:
+        return None
+    places, steady = _followed(before.grey, second, corners)
+    corners = corners[:, 0]
+    # which point of the mesh is seen at a corner: the one drawn where the corner was, before the pose was corrected
+    here = drawn.coords[tuple(np.rint(corners).astype(int).T[::-1])] - model.center
+    corrected = camera.project(pose.apply(here)) - camera.project(before.T_view_ctr.apply(here))
+    columns, rows = np.clip(np.rint(corners - corrected).astype(int), 0, np.array(camera.size) - 1).T
+    steady &= drawn.mask[rows, columns]
+    if steady.sum() < LEAST:
+        return None
+    points = drawn.coords[rows, columns][steady].astype(np.float64) - model.center
+    targets = camera.project(pose.apply(points)) + (places - corners)[steady]
+    return Points(points, targets, np.ones(len(points)), np.full(len(points), SIGMA), together=TOGETHER)
+
+
+def match_texture(look: Look, model: ObjectModel) -> Points | None:
+    """Points of the mesh, as drawn, and where the frame shows the same texture; None where too few are alike.
+
+    Both pictures are compared by their local contrast, since the light differs.
+    """
+    drawn, camera = look.drawn, look.drawn.camera
+    assert drawn.mask is not None and drawn.coords is not None
+    first, second = (_contrast(v.image) for v in (drawn, look.seen))
+    solid = drawn.mask & look.visible & look.seen.shown
+    inside = cv2.erode(solid.astype(np.uint8), np.ones((7, 7), np.uint8))
+    corners = cv2.goodFeaturesToTrack(first, CORNERS, TEXTURE_QUALITY, APART, mask=inside)
+    if corners is None or len(corners) < LEAST:
+        return None
+    places, steady = _followed(first, second, corners)
+    corners = corners[:, 0]
+    steady &= np.linalg.norm(places - corners, axis=1) < FARTHEST
+    if steady.sum() < LEAST:
+        return None
+    corners, places = corners[steady], places[steady]
+    columns, rows = np.rint(corners).astype(int).T
+    least, best = ALIKE
+    weight = np.clip((_alike(first, second, corners, places) - least) / (best - least), 0, 1).astype(np.float64)
+    if (weight > 0).sum() < LEAST:
+        return None
+    points = drawn.coords[rows, columns].astype(np.float64) - model.center
+    targets = camera.project(look.T_view_ctr.apply(points)) + (places - corners)
+    return Points(points, targets, weight, np.full(len(points), TEXTURE_SIGMA), together=TEXTURE_TOGETHER)
+
+
+def _contrast(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Grey values (H, W) less their surroundings' mean, over the surroundings' spread."""
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    centred = grey - cv2.GaussianBlur(grey, (0, 0), ROUND)
+    spread = np.sqrt(cv2.GaussianBlur(centred * centred, (0, 0), ROUND)) + FAINT
+    return np.asarray(np.clip(128 + 40 * centred / spread, 0, 255), np.uint8)
+
+
+def _alike(
+    first: NDArray[np.uint8], second: NDArray[np.uint8], corners: NDArray[np.float32], places: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Correlation (N,), -1 to 1, of the first picture round each corner with the second round its place."""
+    one, other = _patches(first, corners), _patches(second, places)
+    return np.asarray((one * other).sum(axis=1))
+
+
+def _patches(picture: NDArray[np.uint8], centres: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Pixels round each centre (N, 2), without mean and of length one: (N, PATCH**2)."""
+    reach = np.arange(PATCH) - PATCH // 2
+    offsets = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2)
+    at = np.clip(np.rint(centres)[:, None].astype(int) + offsets, 0, np.array(picture.shape[::-1]) - 1)
+    values = picture[at[..., 1], at[..., 0]].astype(np.float32)
+    values -= values.mean(axis=1, keepdims=True)
+    return np.asarray(values / (np.linalg.norm(values, axis=1, keepdims=True) + 1))
+
+
+def _followed(
+    first: NDArray[np.uint8], second: NDArray[np.uint8], corners: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Places (N, 2) in the second picture, and which of them lead back to where they came from."""
+    there, ahead, _ = cv2.calcOpticalFlowPyrLK(first, second, corners, None, winSize=WINDOW, maxLevel=LEVELS)
+    back, behind, _ = cv2.calcOpticalFlowPyrLK(second, first, there, None, winSize=WINDOW, maxLevel=LEVELS)
+    away = np.linalg.norm((back - corners)[:, 0], axis=1)
+    return there[:, 0], (ahead.ravel() > 0) & (behind.ravel() > 0) & (away < AGAIN)

@@ -1,0 +1,411 @@
+"""Tracker: the last pose seeds the next frame's.
+
+Paper, section 3.4: the first frame is estimated and refined; each next frame starts from the last pose. A predicted
+angle above 25 degrees restarts with a new first pose, one below 2 degrees leaves the pose as it is. What goes beyond
+the paper, and why, is in docs/tracking.md.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from posekit.align.colour_edge import Colours, Tint, learn, like_mesh, off_colour, outline_lines
+from posekit.align.fusion import Belief, Points, Term, fuse
+from posekit.camera import Camera
+from posekit.errors import CameraError, ConfigError
+from posekit.estimate.estimator import PoseEstimator, nearest_to
+from posekit.estimate.instances import SearchOptions, find_instances
+from posekit.estimate.refine import crops
+from posekit.geometry import Pose, rotation_angle, so3_exp, so3_log
+from posekit.mesh.model import ObjectModel
+from posekit.nets.pose_delta import apply_delta
+from posekit.nets.precision import usable_cores
+from posekit.nets.predictor import PairPrediction, Predictor
+from posekit.results import Branch, Detection, Estimate
+from posekit.tracking.points import Look, follow_points, match_texture
+from posekit.view import View
+
+TRACKED, RESTARTED, LOST = "tracked", "restarted", "lost"
+MASKS, MOTIONS, RUNTIMES = ("colours", "pose", "none"), ("points", "velocity", "none"), ("openvino", "torch")
+NEAR = 0.6  # diameters, the least distance of an object's centre that is believed
+# standard deviations of a turn in degrees, a shift in pixels of the crop, and a depth in shares of the distance
+GIVEN = (1.0, 0.5, 0.005)  # of a first pose
+AHEAD = (10.0, 8.0, 0.05)  # of the motion between two frames, where they are compared
+UNSEEN = (6.0, 4.0, 0.02)  # of that motion, when nothing else is known about it
+SUREST = (0.5, 0.15, 0.004)  # of any pose: errors last over many frames
+TOGETHER, DOUBTED = 25.0, math.radians(4.0)  # so many correspondences err alike, and at this predicted angle twice that
+TINTED = 0.15  # share of a frame in what is known of the tint
+FACES = 6000  # of the mesh that is drawn: a crop shows no more
+LEAST_SCALE, KNEE = 0.5, 2.5  # pixels, no correspondence is more exact; standard deviations
+
+
+class Finder(Protocol):
+    """Whatever finds objects in a photograph, such as posekit.detect's and posekit.detect.novel's detectors."""
+
+    def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]: ...
+
+
+@dataclass(frozen=True)
+class TrackConfig:
+    """restart_deg, still_deg: predicted angles above which a frame is in doubt, and below which the network leaves the
+    pose to points and outline, both degrees. converged_deg: the predicted angle below which an estimate says
+    that it converged. iterations: comparisons of a frame at most; a second one follows a turn of
+    more than ``again_deg``. motion: where a frame's comparison starts: where followed points lead ("points"), the share
+    ``prior`` of the last motion once more ("velocity"), or the last pose ("none"). outline, texture: whether the
+    colours' place of the outline counts, and the mesh's texture where the frame shows it. mask: what a frame's mask is
+    taken to be: where the silhouette has the object's colours ("colours"), all of it ("pose"), or nothing ("none").
+    keep: share of what was known that holds for the next frame. alike: share of the silhouette with the object's
+    colours, below which a frame is in doubt. learn: share of a frame in these colours. least_inside: share of the
+    silhouette's box in the picture, likewise. doubts: frames in doubt in a row after which the object is lost. search:
+    frames between two attempts to find it. runtime: of the network."""
+
+    restart_deg: float = 25.0
+    still_deg: float = 0.0
+    converged_deg: float = 2.0
+    again_deg: float = 8.0
+    iterations: int = 1
+    motion: str = "points"
+    prior: float = 0.7
+    outline: bool = True
+    texture: bool = True
+    mask: str = "colours"
+    keep: float = 0.7
+    alike: float = 0.3
+    learn: float = 0.1
+    least_inside: float = 0.3
+    doubts: int = 3
+    search: int = 5
+    runtime: str = "openvino"
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.still_deg < self.restart_deg <= 180:
+            raise ConfigError(
+                f"the angle that leaves a pose is from 0 on and below the one that restarts, which is at most 180 "
+                f"degrees; not {self.still_deg:g} and {self.restart_deg:g}."
+            )
+        if min(self.iterations, self.doubts, self.search) < 1:
+            raise ConfigError("iterations, doubts and search are at least 1.")
+        if not all(0 <= share <= 1 for share in (self.prior, self.alike, self.learn, self.least_inside)):
+            raise ConfigError("prior, alike, learn and least_inside are shares between 0 and 1.")
+        if not 0 < self.keep <= 1:
+            raise ConfigError(f"keep is a share above 0, at most 1, not {self.keep:g}.")
+        for name, known in (("mask", MASKS), ("motion", MOTIONS), ("runtime", RUNTIMES)):
+            if getattr(self, name) not in known:
+                raise ConfigError(f"{name} is one of {', '.join(known)}, not {getattr(self, name)!r}.")
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """What a frame says about the object. state: "tracked", "restarted" (a new first pose) or "lost". estimate: None
+    where it is lost; its score is the share of its silhouette that has the object's colours."""
+
+    state: str
+    estimate: Estimate | None = None
+
+    @property
+    def T_cam_obj(self) -> Pose | None:
+        return None if self.estimate is None else self.estimate.T_cam_obj
+
+    @property
+    def reliable(self) -> bool:
+        """Whether there is an estimate that can be used."""
+        return self.estimate is not None and self.estimate.reliable
+
+    @property
+    def angle(self) -> float | None:
+        """The predicted rotation error, radians."""
+        return None if self.estimate is None else self.estimate.angle
+
+
+class Tracker:
+    """Follows one object from frame to frame. Its memory does not grow with the number of frames.
+
+    camera: of all frames, unless `step` is given another. pose: ``T_cam_obj`` in the first frame, where it is known.
+    estimator: of this model; made with the shipped weights where it is not given. detector: finds the object in the
+    first frame and when it is lost; without one a lost object stays lost. predictor: in place of the one that
+    ``config.runtime`` names.
+    Not thread-safe: one tracker per thread. Raises ConfigError where neither pose nor detector is given.
+    """
+
+    def __init__(
+        self,
+        model: ObjectModel,
+        camera: Camera | None = None,
+        *,
+        pose: Pose | None = None,
+        estimator: PoseEstimator | None = None,
+        detector: Finder | None = None,
+        predictor: Predictor | None = None,
+        config: TrackConfig = TrackConfig(),
+    ) -> None:
+        if pose is None and detector is None:
+            raise ConfigError("a tracker needs the first pose, or a detector that finds the object.")
+        self.model, self.camera, self.config = model, camera, config
+        self.estimator = estimator or PoseEstimator(model)
+        self.predictor = predictor or _predictor(self.estimator, config)
+        self.renderer, self.detector = self.estimator.renderer, detector
+        self._drawn = model.simplified(FACES)
+        self._outline = model.outline - model.center
+        self._beside = ThreadPoolExecutor(1, "posekit-network")
+        self._given = pose  # a first pose that no frame has been seen with
+        self._told = pose  # the last ``T_cam_obj`` that was told, whether or not the object was lost since
+        self._belief: Belief | None = None  # ``T_cam_ctr``
+        self._motion = Pose.identity()  # of the object's centre and axes, from the frame before the last to the last
+        self._before: Look | None = None
+        self._colours: Colours | None = None
+        self._tint: Tint | None = None
+        self._doubts = 0
+        self._waiting = 0  # frames until the next search
+
+    def step(
+        self, image: NDArray[np.uint8], camera: Camera | None = None, valid: NDArray[np.bool_] | None = None
+    ) -> Tracked:
+        """The object in the next frame. image: uint8 RGB (H, W, 3). valid: as a `View` has it.
+
+        Raises CameraError where no camera is known."""
+        chosen = camera or self.camera
+        if chosen is None:
+            raise CameraError("the tracker was made without a camera: pass one with each frame.")
+        view = View(image, chosen, valid=valid)
+        if self._given is not None:
+            started, pose, self._given = time.perf_counter(), self._given, None
+            if self._begin(view, pose, math.radians(GIVEN[0])):
+                assert self._before is not None
+                prediction, network = self._asked(self._before.seen, self._before.drawn, self._before.visible)
+                timings = {"network": network, "total": time.perf_counter() - started}
+                given = self._estimate(view, pose, prediction.angle, 0, 1.0, timings)
+                return Tracked(TRACKED, self._on_branch(given, Branch.GIVEN))
+        if self._belief is not None:
+            found = self._follow(view, self._belief)
+            if found is not None and not self._lost_sight(view, found):
+                return Tracked(TRACKED, self._on_branch(found))
+            self._lose()
+        return self._find(view)
+
+    # --- following ---
+
+    def _begin(self, view: View, pose: Pose, turn_std: float) -> bool:
+        """Start from a first pose; whether the mesh is seen there. turn_std: radians."""
+        self._belief = self._before = self._colours = None
+        if not self._in_front(pose):
+            return False
+        seen, drawn = self._crops(view, pose)
+        assert drawn.mask is not None
+        if not (drawn.mask & seen.shown).any():
+            return False
+        centred = pose @ self.model.T_obj_ctr
+        _, shift, depth = GIVEN
+        self._belief = Belief.about(centred, seen.camera, turn_std, shift, depth)
+        visible = like_mesh(seen, drawn)
+        if (visible & drawn.mask).sum() < 0.15 * drawn.mask.sum():
+            visible = np.ones_like(visible)
+        self._colours = learn(seen, drawn.mask, visible)
+        self._tint = Tint.of(off_colour(seen, drawn), visible & drawn.mask)
+        self._before = Look(seen, drawn, Pose.rotation(seen.R_view_cam) @ centred, visible)
+        return True
+
+    def _follow(self, view: View, last: Belief) -> Estimate | None:
+        """From where the object is expected; None where it cannot be compared."""
+        started, network, angle, comparisons = time.perf_counter(), 0.0, 0.0, 0
+        before, colours, tint = self._before, self._colours, self._tint
+        assert before is not None and colours is not None and tint is not None
+        ahead = self._ahead(view, before, last, colours)
+        belief = ahead
+        while comparisons < self.config.iterations:
+            comparisons += 1
+            pose = belief.pose @ self.model.T_obj_ctr.inverse()
+            if not self._in_front(pose):
+                return None
+            seen, drawn = self._crops(view, pose)
+            assert drawn.mask is not None
+            apart = off_colour(seen, drawn)
+            visible = colours.seen(seen) & ~tint.hides(apart, drawn.mask)
+            answer = self._beside.submit(self._asked, seen, drawn, visible)
+            # while the network thinks
+            look = Look(seen, drawn, Pose.rotation(seen.R_view_cam) @ belief.pose, visible)
+            others = self._lines(look, seen, visible, colours) + self._texture(look)
+            learned = colours.mixed(learn(seen, drawn.mask, visible), self.config.learn)
+            tinted = tint.mixed(Tint.of(apart, visible & drawn.mask), TINTED)
+            look.prepare()
+            prediction, seconds = answer.result()
+            network, angle = network + seconds, prediction.angle
+            agreed = self._agreed(ahead, look, prediction, others)
+            if agreed is None:
+                return None
+            turn = math.degrees(rotation_angle(agreed.pose.R @ belief.pose.R.T))
+            belief = agreed
+            if turn < self.config.again_deg:
+                break
+        pose = belief.pose @ self.model.T_obj_ctr.inverse()
+        if not self._in_front(pose):
+            return None
+        assert drawn.mask is not None
+        shown = drawn.mask & seen.shown
+        share = float((visible & shown).sum() / max(1, shown.sum()))
+        self._motion = Pose(belief.pose.R @ last.pose.R.T, belief.pose.t - last.pose.t)
+        self._belief, self._before = belief, look
+        if angle < math.radians(self.config.restart_deg) and share > self.config.alike:
+            self._colours = learned
+        self._tint = tinted
+        timings = {"network": network, "total": time.perf_counter() - started}
+        return self._estimate(view, pose, angle, comparisons, share, timings)
+
+    def _ahead(self, view: View, before: Look, last: Belief, colours: Colours) -> Belief:
+        """Where the object is expected, as ``T_cam_ctr``: from the last frame, without a comparison with the mesh."""
+        camera, R = before.drawn.camera, before.seen.R_view_cam
+        believed = last.turned(R)
+        start = self._expected(believed.pose, R)
+        known: list[Term] = [_about(start, camera, AHEAD)]
+        motion: list[Term] = [_about(start, camera, UNSEEN)]
+        seen = before.again(view)
+        following = self._beside.submit(self._followed, before, start, seen)
+        lines = self._lines(before, seen, before.visible, colours)
+        points = following.result()
+        known += points
+        motion += points
+        found = fuse(start, [*known, *lines], camera)
+        pose = start if found is None else found.pose
+        moved = np.sum([term.equations(pose, camera)[0] for term in motion], axis=0)
+        covariance = believed.covariance / self.config.keep + np.linalg.inv(moved)
+        return Belief(pose, np.asarray(np.linalg.inv(covariance))).turned(R.T)
+
+    def _expected(self, last: Pose, R_view_cam: NDArray[np.float64]) -> Pose:
+        """``T_view_ctr`` after the last motion, where that is to be repeated."""
+        if self.config.motion != "velocity":
+            return last
+        share = self.config.prior
+        turn = so3_exp(R_view_cam @ so3_log(self._motion.R) * share)
+        return Pose(turn @ last.R, last.t + share * (R_view_cam @ self._motion.t))
+
+    def _agreed(self, ahead: Belief, look: Look, prediction: PairPrediction, others: list[Term]) -> Belief | None:
+        """What the network, others that compare the mesh, and the frames before say together."""
+        camera, R = look.drawn.camera, look.seen.R_view_cam
+        network: list[Term] = []
+        if self.config.still_deg <= math.degrees(prediction.angle) < self.config.restart_deg:
+            network = self._network(look, prediction)
+        found = fuse(look.T_view_ctr, [ahead.turned(R), *network, *others], camera)
+        if found is None:
+            return None
+        return found.spread(_about(found.pose, camera, SUREST).covariance).turned(R.T)
+
+    def _followed(self, before: Look, start: Pose, seen: View) -> list[Term]:
+        found = follow_points(before, start, seen, self.model) if self.config.motion == "points" else None
+        return [] if found is None else [found]
+
+    def _texture(self, look: Look) -> list[Term]:
+        found = match_texture(look, self.model) if self.config.texture else None
+        return [] if found is None else [found]
+
+    def _lines(self, look: Look, seen: View, visible: NDArray[np.bool_], colours: Colours) -> list[Term]:
+        """Where the mesh's outline, as it was drawn for ``look``, lies in a crop of the same camera."""
+        if not self.config.outline:
+            return []
+        lines = outline_lines(seen, look.drawn, colours, visible, self.model.center, look.outline)
+        return [] if lines is None else [lines]
+
+    def _crops(self, view: View, pose: Pose) -> tuple[View, View]:
+        """What the frame shows round a ``T_cam_obj``, and the mesh drawn there."""
+        [seen], [drawn] = crops(view, self._drawn, self._outline, [pose], self.predictor.size, self.renderer)
+        return seen, drawn
+
+    def _asked(self, seen: View, drawn: View, visible: NDArray[np.bool_]) -> tuple[PairPrediction, float]:
+        """The network's answer, and the seconds that it took."""
+        assert drawn.mask is not None
+        mask = {"colours": drawn.mask & visible, "pose": drawn.mask, "none": None}[self.config.mask]
+        started = time.perf_counter()
+        [prediction] = self.predictor.predict([seen.with_mask(mask)], [drawn])
+        return prediction, time.perf_counter() - started
+
+    def _network(self, look: Look, prediction: PairPrediction) -> list[Term]:
+        """The network's correspondences, or where it has none, the pose it leads to."""
+        found, camera = prediction.correspondences, look.drawn.camera
+        if found is None:
+            target = apply_delta(look.T_view_ctr, prediction.delta, camera.fx)
+            spread = max(prediction.angle, math.radians(GIVEN[0]))
+            return [Belief.about(target, camera, spread, 1.0, 0.02)] if target.t[2] > 0 else []
+        assert look.drawn.coords is not None
+        points = look.drawn.coords[found.source[:, 1], found.source[:, 0]] - self.model.center
+        if not len(points):
+            return []
+        together = TOGETHER * (1 + (prediction.angle / DOUBTED) ** 2)
+        scale = np.maximum(found.scale_px, LEAST_SCALE)
+        return [Points(points.astype(np.float64), found.target, found.weight, scale, KNEE, together)]
+
+    def _estimate(
+        self, view: View, pose: Pose, angle: float, iterations: int, score: float, timings: dict[str, float]
+    ) -> Estimate:
+        box = view.camera.points_box(_before_camera(pose.apply(self.model.outline)))
+        converged = angle < math.radians(self.config.converged_deg)
+        return Estimate(pose, angle, iterations, converged, score, box, self.model.name, timings=timings)
+
+    def _in_front(self, pose: Pose) -> bool:
+        return bool(np.isfinite(pose.matrix).all() and pose.apply(self.model.center)[2] > NEAR * self.model.diameter)
+
+    def _on_branch(self, found: Estimate, branch: Branch = Branch.LAST) -> Estimate:
+        """Of equivalent poses the one nearest to the last one that was told, where there is one."""
+        if self._told is not None:
+            found = nearest_to(self._told, found, self.model, branch)
+        elif self.model.symmetries:
+            found = replace(found, branch=Branch.ANY)
+        self._told = found.T_cam_obj
+        return found
+
+    # --- losing and finding ---
+
+    def _lost_sight(self, view: View, found: Estimate) -> bool:
+        """Whether too little of the object has been seen for too long; at once where it is outside the picture."""
+        x0, y0, x1, y1 = found.box
+        width, height = view.camera.size
+        inside = max(0.0, min(x1, width) - max(x0, 0.0)) * max(0.0, min(y1, height) - max(y0, 0.0))
+        share = inside / max((x1 - x0) * (y1 - y0), 1e-9)
+        doubted = (
+            share < self.config.least_inside
+            or found.score < self.config.alike
+            or math.degrees(found.angle) > self.config.restart_deg
+        )
+        self._doubts = self._doubts + 1 if doubted else 0
+        return share == 0 or self._doubts >= self.config.doubts
+
+    def _lose(self) -> None:
+        self._belief = self._before = self._colours = None
+        self._motion, self._doubts, self._waiting = Pose.identity(), 0, 0
+
+    def _find(self, view: View) -> Tracked:
+        """A new first pose, where there is one. A search takes seconds, so not every frame is searched."""
+        self._waiting -= 1
+        if self.detector is None or self._waiting > 0:
+            return Tracked(LOST)
+        self._waiting = self.config.search
+        detections = self.detector.detect(view, [self.model])
+        # nobody vouches for every frame's detections: poses must be borne out, whoever detects
+        [found] = find_instances(lambda _: self.estimator, view, [self.model], detections, SearchOptions())
+        if not found.instances or not self._begin(view, found.instances[0].T_cam_obj, found.instances[0].angle):
+            return Tracked(LOST)
+        self._waiting = 0
+        return Tracked(RESTARTED, self._on_branch(found.instances[0]))
+
+
+def _about(pose: Pose, camera: Camera, spread: tuple[float, float, float]) -> Belief:
+    turn, shift, depth = spread
+    return Belief.about(pose, camera, math.radians(turn), shift, depth)
+
+
+def _predictor(estimator: PoseEstimator, config: TrackConfig) -> Predictor:
+    if config.runtime == "torch" or estimator.predictor.device.type != "cpu":
+        return estimator.predictor
+    from posekit.nets.openvino import OpenVinoPredictor
+
+    return OpenVinoPredictor(estimator.networks, threads=max(1, usable_cores() // 2))  # the rest works beside it
+
+
+def _before_camera(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    points[:, 2] = np.maximum(points[:, 2], 1e-3)
+    return points

@@ -1,0 +1,1 @@
+"""Training samples: pairs, crops and their streams."""
