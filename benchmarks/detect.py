@@ -1,6 +1,6 @@
 """How well objects are found in photographs with known truth.
 
-    python benchmarks/detect.py ROOT [--detector novel|FILE] [--min-visible 0.9] [--images N] [--least 0.05]
+    python benchmarks/detect.py ROOT [--detector novel|FILE] [--min-visible 0.9] [--images N] [--min-score 0.05]
 
 ROOT is a data set in BOP layout. Prints, for instances at least so visible, the share of those whose object's
 best-scored detection overlaps the true box (of the visible part) by half at least, and their mask; for those over 10 %
@@ -32,12 +32,12 @@ def main() -> None:
     parser.add_argument("--detector", default="novel")
     parser.add_argument("--min-visible", type=float, default=0.9)
     parser.add_argument("--images", type=int)
-    parser.add_argument("--least", type=float, help="least score of a detection; average precision wants it low")
+    parser.add_argument("--min-score", type=float, help="least score of a detection; average precision wants it low")
     args = parser.parse_args()
     data = BopDataset(args.root)
     numbers = data.model_ids()
     models = {number: data.model(number) for number in numbers}
-    detector, _ = make_detector(args.detector, list(models.values()), least=args.least)
+    detector, _ = make_detector(args.detector, list(models.values()), min_score=args.min_score)
     by_name = {model.name: number for number, model in models.items()}
     truths: list[Truth] = []
     found: list[Found] = []

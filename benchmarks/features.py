@@ -75,10 +75,10 @@ def main() -> None:
     parser.add_argument("--procedural", type=int, default=20)
     parser.add_argument("--scenes", type=int, default=60)
     parser.add_argument("--seed", type=int, default=22)
-    parser.add_argument("--least", type=int, default=FeatureOptions().least)
+    parser.add_argument("--min-matches", type=int, default=FeatureOptions().min_matches)
     parser.add_argument("--box", action="store_true")
     args = parser.parse_args()
-    options, renderer = FeatureOptions(least=args.least), Renderer()
+    options, renderer = FeatureOptions(min_matches=args.min_matches), Renderer()
     if args.bop:
         cases = photographed(BopDataset(args.bop), renderer, options, args.box, args.seed)
     else:
@@ -134,7 +134,7 @@ def scene(
     size = np.exp(rng.uniform(np.log(50), np.log(300)))
     depth = CAMERA.fx * model.diameter / size
     pixel = [rng.uniform(0.2, 0.8) * CAMERA.width, rng.uniform(0.2, 0.8) * CAMERA.height]
-    truth = Pose(random_rotation(rng), CAMERA.backproject(pixel, depth)) @ model.T_obj_ctr.inverse()
+    truth = Pose(random_rotation(rng), CAMERA.backproject(pixel, depth)) @ model.T_ctr_obj
     light = Light(float(rng.uniform(0.3, 0.7)), tuple(rng.normal(size=3) - [0, 0, 1]), 0.6, 0.2)
     drawn = renderer.render(model, [truth], CAMERA, light=light, coords=False)[0]
     mask = drawn.mask.copy()

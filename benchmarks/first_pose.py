@@ -71,7 +71,7 @@ def rendered(count: int, photos: Path, seed: int, plain: bool) -> Iterator[Case]
         for scene in render_scenes(renderer, model, PER_OBJECT, config, rng):
             picture, _ = observe(scene.rgba, others, backgrounds, augment, rng)
             view = view_of(picture, scene.camera).with_mask(None)
-            yield Case(view, known, scene.T_view_ctr @ model.T_obj_ctr.inverse(), scene.box)
+            yield Case(view, known, scene.T_view_ctr @ model.T_ctr_obj, scene.box)
 
 
 def wrong_box(box: Box, wrong: float, rng: np.random.Generator) -> Box:

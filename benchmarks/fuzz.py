@@ -383,7 +383,7 @@ def read_mesh(path: Path) -> object:
     from posekit.mesh.model import ObjectModel
 
     model = ObjectModel.load(path)
-    return model.diameter, model.outline
+    return model.diameter, model.hull_vertices
 
 
 def read_camera(path: Path) -> object:

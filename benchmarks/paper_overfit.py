@@ -86,7 +86,7 @@ def shares_within_5(dataset: BopDataset, weights: Path) -> tuple[float, float]:
         for _ in range(DRAWS):
             detection = Detection(disturbed_box(box, SceneConfig(), rng), mask)
             first = [h.T_cam_obj for h in search.search(view, detection, 1)]
-            disturbed = disturbed_pose(truth @ model.T_obj_ctr, model.diameter, rng) @ model.T_obj_ctr.inverse()
+            disturbed = disturbed_pose(truth @ model.T_obj_ctr, model.diameter, rng) @ model.T_ctr_obj
             for starts, hits in zip((first, [disturbed]), within_5, strict=True):
                 found = refine(view, model, starts, predictor, renderer, options)
                 errors = [pose_error(f.T_cam_obj, truth, [Pose.identity()]) for f in found]

@@ -109,7 +109,7 @@ def main() -> None:
     parser.add_argument("--shapes", type=Path, help="pybullet's wheel")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--largest-kb", type=int, default=3000, help="of a mesh with its textures")
-    parser.add_argument("--most-shapes", type=int, default=200)
+    parser.add_argument("--max-detections-shapes", type=int, default=200)
     args = parser.parse_args()
     if args.out.exists() and any(args.out.iterdir()):
         parser.error(f"{args.out} holds files: name another folder")

@@ -153,12 +153,12 @@ def test_estimate_writes_a_result_and_an_overlay(invoke: Invoke, tmp_path: Path)
 @pytest.mark.parametrize("command", ["estimate", "refine"])
 @pytest.mark.parametrize("least", [0.0, 2.0])
 def test_what_is_not_reliable_says_so_first(
-    invoke: Invoke, monkeypatch: pytest.MonkeyPatch, command: str, least: float
+    invoke: Invoke, monkeypatch: pytest.MonkeyPatch, command: str, min_score: float
 ) -> None:
-    monkeypatch.setattr(results, "RELIABLE_SCORE", least)
+    monkeypatch.setattr(results, "RELIABLE_SCORE", min_score)
     monkeypatch.setattr(results, "RELIABLE_ANGLE_DEG", 180.0)
     found = invoke(command, None, "--require-reliable", json="-")
-    reliable = least == 0.0
+    reliable = min_score == 0.0
     assert found.exit_code == (0 if reliable else 3), found.output
     assert json.loads(found.stdout)["estimates"][0]["reliable"] is reliable, "written all the same"
     first = next(line for line in found.stderr.splitlines() if line.startswith("toy: "))

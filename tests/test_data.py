@@ -215,7 +215,7 @@ def test_the_numbers_of_mvnets_samples_are_true() -> None:
     for scene in render_scenes(renderer, model, 6, config, rng):
         sample = box_sample(scene.rgba, scene, frontal, config, rng)
         source = frontal_pose(frontal.camera, frontal.distance, sample.camera)
-        pose = apply_delta(source, sample.delta, sample.camera.fx) @ model.T_obj_ctr.inverse()
+        pose = apply_delta(source, sample.delta, sample.camera.fx) @ model.T_ctr_obj
         (drawn,) = renderer.render(model, [pose], sample.camera, coords=False)
         seen = sample.observed[..., 3] > 0
         assert drawn.mask is not None

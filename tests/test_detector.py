@@ -34,7 +34,7 @@ from posekit.detect.maskrcnn import (
     load_detector,
     save_detector,
 )
-from posekit.detect.novel import LikenedDetector, NovelDetector
+from posekit.detect.novel import NovelDetector, SimilarityDetector
 from posekit.detect.segmentation import decode, encode
 from posekit.detect.vision import nms, roi_align, torchvision
 from posekit.errors import ConfigError, PromptError, WeightsError
@@ -126,7 +126,7 @@ def test_weights_come_back_and_are_read_strictly(tmp_path: Path, untrained: Trai
         again = load_detector(given)
         assert (again.digest, again.config, again.about["steps"]) == (digest, TINY, 3)
     image = np.random.default_rng(0).integers(0, 255, (96, 128, 3), dtype=np.uint8)
-    a, b = find(untrained, image, least=0.0), find(again, image, least=0.0)
+    a, b = find(untrained, image, min_score=0.0), find(again, image, min_score=0.0)
     assert len(a.scores) and np.abs(a.scores.max() - b.scores.max()) < 0.02
     data = (tmp_path / "detector.safetensors").read_bytes()
     (tmp_path / "detector.safetensors").write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
@@ -143,7 +143,7 @@ def test_a_detector_reports_its_classes_only(untrained: TrainedDetector) -> None
     view = View(np.zeros((96, 128, 3), np.uint8), Camera.from_fov(1.0, 128, 96))
     with pytest.raises(ConfigError, match=r"does not know bracket; it was trained for object"):
         MaskRCNN(untrained).detect(view, [bracket()])
-    found = MaskRCNN(untrained, least=0.0).detect(view, [])
+    found = MaskRCNN(untrained, min_score=0.0).detect(view, [])
     assert found and {d.label for d in found} == {"object"}
     assert all(d.mask is not None and d.mask.shape == (96, 128) for d in found)
     with pytest.raises(ConfigError, match="backbone is one of"):
@@ -401,7 +401,7 @@ def test_proposals_are_compared_with_the_mesh(renderer: Renderer, untrained: Tra
     camera = Camera.from_fov(0.9, 320, 240)
     image, proposals = np.full((240, 320, 3), 90, np.uint8), []
     for k, model in enumerate(meshes):
-        pose = Pose(random_rotation(rng), np.array([0.16 * (k - 1), 0.0, 0.7])) @ model.T_obj_ctr.inverse()
+        pose = Pose(random_rotation(rng), np.array([0.16 * (k - 1), 0.0, 0.7])) @ model.T_ctr_obj
         [drawn] = renderer.render(model, [pose], camera)
         assert drawn.mask is not None
         image[drawn.mask] = drawn.image[drawn.mask]
@@ -427,17 +427,17 @@ def test_looks_in_two_sizes_are_joined(untrained: TrainedDetector, monkeypatch: 
     )
     monkeypatch.setattr(maskrcnn, "find", lambda *_, **__: next(looks))
     image = np.zeros((60, 80, 3), np.uint8)
-    found = maskrcnn.find_in_looks(untrained, image, ((1.0, False), (2.0, False)), least=0.15)
+    found = maskrcnn.find_augmented(untrained, image, ((1.0, False), (2.0, False)), min_score=0.15)
     assert found.scores.tolist() == pytest.approx([0.6, 0.2]) and found.labels.tolist() == [0, 0]
     np.testing.assert_allclose(found.boxes, [[4.5, 4, 20.5, 20], [40, 30, 60, 50]], atol=1e-4)
     looks = iter([Found(np.zeros((0, 4)), np.zeros(0, np.int64), np.zeros(0), masks[:0])] * 2)
-    assert not len(maskrcnn.find_in_looks(untrained, image, ((1.0, False), (2.0, False)), least=0.15).scores)
+    assert not len(maskrcnn.find_augmented(untrained, image, ((1.0, False), (2.0, False)), min_score=0.15).scores)
 
 
 def test_what_looks_like_the_mesh_counts_for_more(renderer: Renderer) -> None:
     """Two detections of the same score: the bracket itself, and a grey patch."""
     camera, model = Camera.from_fov(0.9, 160, 120), bracket()
-    pose = Pose(view_rotation([0.5, -1.0, 0.6]), [-0.06, 0.0, 0.5]) @ model.T_obj_ctr.inverse()
+    pose = Pose(view_rotation([0.5, -1.0, 0.6]), [-0.06, 0.0, 0.5]) @ model.T_ctr_obj
     [drawn] = renderer.render(model, [pose], [camera])
     assert drawn.mask is not None
     image = np.where(drawn.mask[..., None], drawn.image, 128).astype(np.uint8)
@@ -451,14 +451,14 @@ def test_what_looks_like_the_mesh_counts_for_more(renderer: Renderer) -> None:
             return [Detection(b, m, 0.4, "bracket", Source.TRAINED) for b, m in zip(boxes, masks, strict=True)]
 
     view = View(image, camera)
-    finder = LikenedDetector(Trained(), renderer, 0.5)  # type: ignore[arg-type]
+    finder = SimilarityDetector(Trained(), renderer, 0.5)  # type: ignore[arg-type]
     [found] = finder.detect(view, [model])
     assert found.box == boxes[0] and found.score > 0.8 and found.source == "mask-rcnn"
-    finder = LikenedDetector(Trained(), renderer, 0.0)  # type: ignore[arg-type]
+    finder = SimilarityDetector(Trained(), renderer, 0.0)  # type: ignore[arg-type]
     assert finder.detect(view, [model])[1].score < 0.3
     plain = dataclasses.replace(model, colors=None)
     assert [d.score for d in finder.detect(view, [plain])] == [0.4, 0.4], "nothing to compare colours with"
-    finder = LikenedDetector(Trained(), renderer, 0.0, most=1)  # type: ignore[arg-type]
+    finder = SimilarityDetector(Trained(), renderer, 0.0, max_detections=1)  # type: ignore[arg-type]
     assert [d.box for d in finder.detect(view, [model])] == [boxes[0]]
 
 
@@ -475,7 +475,7 @@ def test_a_mirrored_look_is_mirrored_back(untrained: TrainedDetector, monkeypatc
     image = np.zeros((60, 80, 3), np.uint8)
     image[10:30, 5:25] = 200
     for looks in (((1.0, True),), ((1.0, False), (1.5, True))):
-        found = maskrcnn.find_in_looks(untrained, image, looks, least=0.5)
+        found = maskrcnn.find_augmented(untrained, image, looks, min_score=0.5)
         np.testing.assert_allclose(found.boxes, [[5, 10, 25, 30]], atol=1e-4)
         np.testing.assert_array_equal(found.masks[0], image[..., 0] > 100)
         assert found.scores.tolist() == pytest.approx([0.8]), "one instance, seen by every look"
@@ -498,7 +498,7 @@ def test_detect_and_estimate_where_nothing_is(tmp_path: Path) -> None:
     out = tmp_path / "found"
     result = CliRunner().invoke(app, ["detect", *common, "--out", str(out)])
     assert result.exit_code == 0, result.output
-    assert "nothing in the picture could be taken for box" in result.output
+    assert "box not found" in result.output
     assert json.loads((out / "bop.json").read_text()) == []
     assert json.loads((out / "coco.json").read_text())["annotations"] == []
     result = CliRunner().invoke(app, ["estimate", *common, "--out", str(tmp_path / "poses")])

@@ -9,9 +9,9 @@ import pytest
 
 from posekit.camera import Camera
 from posekit.errors import ConfigError, WeightsError
-from posekit.estimate.estimator import EstimateOptions, PoseEstimator, presence, score
+from posekit.estimate.estimator import EstimateOptions, PoseEstimator, existence_score, score
 from posekit.estimate.refine import pose_change
-from posekit.first_pose.hypotheses import poses_beside
+from posekit.first_pose.hypotheses import perturbed_poses
 from posekit.geometry import Pose, PoseNoise
 from posekit.metrics import pose_error
 from posekit.nets.weights import build, save_networks
@@ -40,7 +40,7 @@ def test_refinement_brings_disturbed_poses_nearer(examples) -> None:
     before, after = [], []
     for example in examples * 2:
         start = PoseNoise().disturb(example.T_cam_obj @ example.model.T_obj_ctr, rng)
-        start = start @ example.model.T_obj_ctr.inverse()
+        start = start @ example.model.T_ctr_obj
         view = example.view.with_mask(masked(estimator.renderer, example).mask)
         found = estimator.refine(view, start)
         assert 1 <= found.iterations <= 6 and len(found.trace) == found.iterations
@@ -116,7 +116,7 @@ def test_a_pose_outside_the_picture_does_not_break_the_loop(examples) -> None:
 
 def test_poses_beside_a_known_one_compete_with_it(examples) -> None:
     example = examples[0]
-    around = poses_beside(example.T_cam_obj, example.model, np.deg2rad(12))
+    around = perturbed_poses(example.T_cam_obj, example.model, np.deg2rad(12))
     centre = example.model.center
     for pose in around:
         turn, _ = pose_change(pose, example.T_cam_obj)
@@ -130,11 +130,11 @@ def test_poses_beside_are_tried_where_the_given_one_does_not_converge(
     stop_angle: float, beside: bool, tried: list[int], examples, monkeypatch: pytest.MonkeyPatch
 ) -> None:  # type: ignore[no-untyped-def]
     example, starts = examples[0], []
-    options = EstimateOptions(iterations=4, stop_angle_deg=stop_angle, beside=beside)
+    options = EstimateOptions(iterations=4, stop_angle_deg=stop_angle, perturb=beside)
     estimator = PoseEstimator(example.model, options=options)
     heats = estimator._heats
     monkeypatch.setattr(estimator, "_heats", lambda view, poses: starts.append(len(poses)) or heats(view, poses))
-    found = estimator.refine(example.view, poses_beside(example.T_cam_obj, example.model, np.deg2rad(20))[0])
+    found = estimator.refine(example.view, perturbed_poses(example.T_cam_obj, example.model, np.deg2rad(20))[0])
     assert starts == tried
     assert found.iterations == (1 if stop_angle == 180 else 4)
 
@@ -143,17 +143,21 @@ def test_an_exact_mask_finishes_the_pose(examples) -> None:
     """With the outline nearer than without, and a rough mask leaves the network's pose."""
     example = examples[0]
     there, networks = (
-        PoseEstimator(example.model, options=EstimateOptions(iterations=1, contour=contour))
+        PoseEstimator(example.model, options=EstimateOptions(iterations=1, mask_edge=contour))
         for contour in (True, False)
     )
     mask = masked(there.renderer, example).mask
     assert mask is not None
-    view, start = example.view.with_mask(mask), poses_beside(example.T_cam_obj, example.model, np.deg2rad(12))[0]
+    view, start = example.view.with_mask(mask), perturbed_poses(example.T_cam_obj, example.model, np.deg2rad(12))[0]
     with_it, without = there.refine(view, start), networks.refine(view, start)
     assert with_it.iterations == without.iterations
     turns = [pose_change(found.T_cam_obj, example.T_cam_obj)[0] for found in (with_it, without)]
     assert turns[0] < turns[1] and np.rad2deg(turns[0]) < 1.5, np.rad2deg(turns)
-    assert with_it.contour_std is not None and 0 < with_it.contour_std < np.deg2rad(4) and without.contour_std is None
+    assert (
+        with_it.mask_edge_std is not None
+        and 0 < with_it.mask_edge_std < np.deg2rad(4)
+        and without.mask_edge_std is None
+    )
     box = np.zeros_like(mask)
     x0, y0, x1, y1 = (int(edge) for edge in example.box)
     box[y0:y1, x0:x1] = True
@@ -176,11 +180,11 @@ def test_what_is_not_there_is_doubted(examples) -> None:
     assert shown.score > 0.8 > 0.4 > absent.score
     [again] = PoseEstimator(other).estimate(example.view, [detection], 1.0)
     assert again.score < 0.5 and again.iterations == 3 and not again.converged, "not refined to the end"
-    usual = presence(0.2, 2.0, 0.05)
-    assert 0 < presence(0.1, 2.0, 0.05) < usual < 1, "less alike"
-    assert presence(0.2, 4.0, 0.05) < usual, "less exact"
-    assert presence(0.2, 2.0, 0.1) < usual, "further off"
-    assert presence(0.2, 2.0, 0.0) == presence(0.2, 2.0, 1e-3), "no angle is too small"
+    usual = existence_score(0.2, 2.0, 0.05)
+    assert 0 < existence_score(0.1, 2.0, 0.05) < usual < 1, "less alike"
+    assert existence_score(0.2, 4.0, 0.05) < usual, "less exact"
+    assert existence_score(0.2, 2.0, 0.1) < usual, "further off"
+    assert existence_score(0.2, 2.0, 0.0) == existence_score(0.2, 2.0, 1e-3), "no angle is too small"
 
 
 def test_first_poses_come_from_both_masks(examples) -> None:

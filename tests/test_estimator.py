@@ -69,14 +69,14 @@ def test_the_angle_is_that_of_the_pose_which_is_told(networks: Networks) -> None
     estimator = oracle(model, TRUTH, networks, stop="fixed", iterations=1, contour=False, outline=False)
     found = estimator.refine(photograph(model, TRUTH).with_mask(None), start)
     assert found.trace[0].angle == pytest.approx(0.3, abs=0.01)
-    assert found.angle < 0.01 and found.converged and found.contour_std is None
+    assert found.angle < 0.01 and found.converged and found.mask_edge_std is None
     far = oracle(model, TRUTH, networks, stop="fixed", iterations=1, contour=False, outline=False)
     far.predictor = Oracle(model, TRUTH, angles=[0.4])  # type: ignore[assignment]
     doubted = far.refine(photograph(model, TRUTH).with_mask(None), start)
     assert doubted.angle == pytest.approx(0.4) and not doubted.converged
     masked = oracle(model, TRUTH, networks, stop="fixed", iterations=1).refine(photograph(model, TRUTH), start)
-    assert masked.contour_std is not None and masked.contour_std > 0
-    assert masked.converged == (masked.contour_std < np.deg2rad(2)) and masked.angle != masked.contour_std
+    assert masked.mask_edge_std is not None and masked.mask_edge_std > 0
+    assert masked.converged == (masked.mask_edge_std < np.deg2rad(2)) and masked.angle != masked.mask_edge_std
 
 
 def test_the_paper_preset_needs_no_option(tmp_path: Path) -> None:
@@ -144,7 +144,7 @@ def test_a_tracked_pose_stays_on_its_branch() -> None:
         def __init__(self) -> None:
             self.model, self.renderer = model, renderer
 
-        def estimate(self, view: View, detections: list[Detection], least: float = 0.0) -> list[Estimate]:
+        def estimate(self, view: View, detections: list[Detection], min_score: float = 0.0) -> list[Estimate]:
             return [Estimate(TRUTH @ S, 0.1, 3, True, 0.9, d.box, model.name, d) for d in detections]
 
         def detect(self, view: View, models: list[ObjectModel]) -> list[Detection]:

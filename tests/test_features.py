@@ -65,7 +65,7 @@ def photograph(renderer: Renderer, model: ObjectModel, poses: list[Pose]) -> Vie
 
 
 def at(model: ObjectModel, seed: int, x: float, y: float = 0.0, z: float = 0.7) -> Pose:
-    return Pose(random_rotation(np.random.default_rng(seed)), np.array([x, y, z])) @ model.T_obj_ctr.inverse()
+    return Pose(random_rotation(np.random.default_rng(seed)), np.array([x, y, z])) @ model.T_ctr_obj
 
 
 def assert_near(model: ObjectModel, found: Pose, truth: Pose) -> None:
@@ -80,7 +80,7 @@ def test_a_textured_box_is_found(renderer: Renderer, seed: int, boxed: bool) -> 
     model = textured()
     truth = at(model, seed, 0.05 * seed - 0.1, 0.03)
     view = photograph(renderer, model, [truth])
-    box = CAMERA.points_box(truth.apply(model.outline))
+    box = CAMERA.points_box(truth.apply(model.hull_vertices))
     [found] = FeatureSearch(model, renderer).search(view, box if boxed else None)
     assert_near(model, found.T_cam_obj, truth)
     np.testing.assert_allclose(found.box, box, atol=4)
@@ -195,4 +195,4 @@ def test_what_texture_shows_is_detected_without_any_proposal(
     [found] = detector.detect(photograph(renderer, model, [truth]), [model])
     assert (found.source, found.label, found.mask) == ("features", "box", None)
     assert 0.5 <= found.score < 1
-    np.testing.assert_allclose(found.box, CAMERA.points_box(truth.apply(model.outline)), atol=4)
+    np.testing.assert_allclose(found.box, CAMERA.points_box(truth.apply(model.hull_vertices)), atol=4)

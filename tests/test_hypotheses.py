@@ -12,7 +12,7 @@ from objects import bracket
 from posekit.camera import Camera, mask_box
 from posekit.errors import WeightsError
 from posekit.estimate.refine import crops
-from posekit.first_pose.hypotheses import BoxSearch, Judge, MVNetSearch, TemplateSearch, agreement_of
+from posekit.first_pose.hypotheses import BoxSearch, EvidenceScorer, MVNetSearch, TemplateSearch, agreement_of
 from posekit.geometry import Pose, random_rotation, rotation_angle, so3_exp
 from posekit.nets.heads import Prediction
 from posekit.nets.pose_delta import delta_between
@@ -46,7 +46,7 @@ def test_the_search_finds_the_pose_among_its_best(renderer: Renderer) -> None:
     near, depths, sides = [], [], []
     for _ in range(12):
         place = np.array([rng.uniform(-0.3, 0.3), rng.uniform(-0.2, 0.2), rng.uniform(0.5, 1.0)])
-        truth = Pose(random_rotation(rng), place) @ model.T_obj_ctr.inverse()
+        truth = Pose(random_rotation(rng), place) @ model.T_ctr_obj
         view, detection = seen(renderer, truth)
         found = search.search(view, detection, 5)
         assert 1 <= len(found) <= 5
@@ -66,7 +66,7 @@ def test_a_box_is_enough(renderer: Renderer) -> None:
     search, near, depths = BoxSearch(model, renderer), [], []
     for _ in range(8):
         place = np.array([rng.uniform(-0.2, 0.2), rng.uniform(-0.15, 0.15), rng.uniform(0.5, 1.0)])
-        truth = Pose(random_rotation(rng), place) @ model.T_obj_ctr.inverse()
+        truth = Pose(random_rotation(rng), place) @ model.T_ctr_obj
         view, detection = seen(renderer, truth)
         ground = rng.integers(90, 130, size=view.image.shape).astype(np.uint8)
         view = View(np.where(detection.mask[..., None], view.image, ground), CAMERA)  # type: ignore[index]
@@ -85,7 +85,7 @@ def test_a_box_is_enough(renderer: Renderer) -> None:
 
 def test_hypotheses_lie_apart_and_an_empty_mask_gives_none(renderer: Renderer) -> None:
     model = bracket()
-    truth = Pose(np.eye(3), [0.0, 0.0, 0.7]) @ model.T_obj_ctr.inverse()
+    truth = Pose(np.eye(3), [0.0, 0.0, 0.7]) @ model.T_ctr_obj
     view, detection = seen(renderer, truth)
     search = TemplateSearch(model, renderer)
     found = search.search(view, detection, 8)
@@ -97,11 +97,11 @@ def test_hypotheses_lie_apart_and_an_empty_mask_gives_none(renderer: Renderer) -
 
 def test_agreement_is_best_at_the_truth(renderer: Renderer) -> None:
     model = bracket()
-    truth = Pose(random_rotation(np.random.default_rng(2)), [0.1, -0.05, 0.7]) @ model.T_obj_ctr.inverse()
+    truth = Pose(random_rotation(np.random.default_rng(2)), [0.1, -0.05, 0.7]) @ model.T_ctr_obj
     view, detection = seen(renderer, truth)
     turned = Pose(truth.R @ so3_exp([0.3, 0.2, 0]), truth.t)
     away = Pose(truth.R, truth.t + [0.3, 0, 0])
-    outline, poses = model.outline - model.center, [truth, turned, away]
+    outline, poses = model.hull_ctr, [truth, turned, away]
     looked = crops(view.with_mask(detection.mask), model, outline, poses, (160, 120), renderer)
     best, worse, worst = map(agreement_of, *looked)
     assert best.silhouette > 0.93 and best.colour > 0.65
@@ -109,14 +109,14 @@ def test_agreement_is_best_at_the_truth(renderer: Renderer) -> None:
     assert best.structure > 0.25 and best.structure > 1.5 * worse.structure and abs(worst.structure) < 0.05
     [unmasked], [drawn] = crops(view, model, outline, [truth], (160, 120), renderer)
     assert agreement_of(unmasked, drawn).silhouette == 1.0, "without a mask"
-    judged = Judge(view, detection.box, model, renderer).scores([truth, turned, away])
+    judged = EvidenceScorer(view, detection.box, model, renderer).scores([truth, turned, away])
     assert judged[0] > judged[1] > judged[2] == 0.0
 
 
 def test_mvnet_answers_relative_to_the_frontal_view(renderer: Renderer) -> None:
     """With an MV-Net that knows the truth the first pose is the truth: its frame is what the docstring says."""
     model = bracket()
-    truth = Pose(random_rotation(np.random.default_rng(3)), [0.25, -0.15, 0.8]) @ model.T_obj_ctr.inverse()
+    truth = Pose(random_rotation(np.random.default_rng(3)), [0.25, -0.15, 0.8]) @ model.T_ctr_obj
     view, detection = seen(renderer, truth)
     networks = build("paper", PaperConfig((160, 120), 0.125))
     search = MVNetSearch(model, networks, renderer)

@@ -172,8 +172,8 @@ def test_the_turn_is_the_one_between_pictures(made) -> None:  # type: ignore[no-
 def oracle(search: MatchingSearch, crop: View, T_crop_ctr: Pose, model: ObjectModel, matched: bool) -> Answer:
     """What a perfect network says of a crop whose truth is known; without ``matched`` it finds no cells."""
     camera, (h, w) = crop.camera, QUERIES.cells
-    drawn = Renderer().render(model, [T_crop_ctr @ model.T_obj_ctr.inverse()], camera.resized(w, h), rgb=False)[0]
-    mask = Renderer().render(model, [T_crop_ctr @ model.T_obj_ctr.inverse()], camera.resized(2 * w, 2 * h))[0].mask
+    drawn = Renderer().render(model, [T_crop_ctr @ model.T_ctr_obj], camera.resized(w, h), rgb=False)[0]
+    mask = Renderer().render(model, [T_crop_ctr @ model.T_ctr_obj], camera.resized(2 * w, 2 * h))[0].mask
     assert drawn.coords is not None and drawn.mask is not None and mask is not None
     R = rotation_between(T_crop_ctr.t, [0, 0, 1]) @ T_crop_ctr.R
     relation = Relation.of(R, search.rotations, QUERIES)
@@ -195,7 +195,7 @@ def test_an_oracle_gives_the_true_pose(renderer: Renderer, matched: bool, monkey
     turns, places, overlaps = [], [], []
     for _ in range(6):
         place = np.array([rng.uniform(-0.2, 0.2), rng.uniform(-0.15, 0.15), rng.uniform(0.5, 0.9)])
-        truth = Pose(random_rotation(rng), place) @ model.T_obj_ctr.inverse()
+        truth = Pose(random_rotation(rng), place) @ model.T_ctr_obj
         drawn = renderer.render(model, [truth], camera)[0]
         assert drawn.mask is not None
         box = mask_box(drawn.mask)

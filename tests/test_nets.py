@@ -21,7 +21,7 @@ from posekit.errors import ConfigError, WeightsError
 from posekit.nets.flownet import LAYERS, FlowNetEncoder
 from posekit.nets.heads import PoseHeads, Prediction, compress_angle, expand_angle
 from posekit.nets.inputs import images_to_tensor, relief, to_input
-from posekit.nets.lite import LiteConfig, LiteSVNet, attention, likeness_of, normals_of, soft_flow, warp, with_none
+from posekit.nets.lite import LiteConfig, LiteSVNet, attention, normals_of, similarity_of, soft_flow, warp, with_none
 from posekit.nets.losses import Target, dense_loss, matching_loss, mvnet_loss, svnet_loss, true_score
 from posekit.nets.paper import Branch, PaperMVNet, PaperSVNet
 from posekit.nets.precision import choose_device
@@ -117,7 +117,7 @@ def test_lite_answers_on_its_anchors() -> None:
     assert [f.shape for f in output.flows] == [(3, 2, 6, 8)] * 2
     assert [f.shape for f in output.rigid] == [(3, 2, 12, 16)] * 2
     assert output.compressed_angle.shape == (3,)
-    assert [x.shape for x in output.likenesses] == [(3, 48, 49)] * 2
+    assert [x.shape for x in output.similarities] == [(3, 48, 49)] * 2
     assert prediction.certainty is not None and prediction.certainty.shape == (3, 12, 16)
     assert prediction.silhouettes is not None and prediction.silhouettes.shape == (3, 2, 12, 16)
     assert prediction.score is not None and prediction.score.shape == (3,)
@@ -143,11 +143,11 @@ def test_matching_finds_a_shifted_picture() -> None:
     rendered = torch.randn(1, 64, 12, 16, generator=generator)
     observed = torch.roll(rendered, shifts=(1, 2), dims=(2, 3))  # down 1, right 2
     none = torch.full((1, 192, 1), -10.0)
-    flow, found = soft_flow(with_none(50 * likeness_of(rendered, observed), none), (12, 16))
+    flow, found = soft_flow(with_none(50 * similarity_of(rendered, observed), none), (12, 16))
     inner = flow[0, :, :11, :14]  # what was not rolled over the side
     torch.testing.assert_close(inner, torch.tensor([16.0, 8.0]).view(2, 1, 1).expand_as(inner), atol=0.05, rtol=0)
     assert float(found[:, 0].min()) > 0.9 and float(found[:, 1].max()) < 1e-3
-    _, found = soft_flow(with_none(50 * likeness_of(rendered, observed), none + 100), (12, 16))
+    _, found = soft_flow(with_none(50 * similarity_of(rendered, observed), none + 100), (12, 16))
     assert float(found[:, 1].min()) > 0.99, "no cell is shown"
 
 

@@ -315,7 +315,7 @@ def test_useless_normals_are_repaired() -> None:
 def test_a_flat_object_has_a_diameter_and_an_outline() -> None:
     model = ObjectModel.from_arrays([[0, 0, 0], [0.3, 0, 0], [0.3, 0.4, 0], [0, 0.4, 0]], [[0, 1, 2], [0, 2, 3]])
     assert model.diameter == pytest.approx(0.5)
-    assert len(model.outline) == 4
+    assert len(model.hull_vertices) == 4
 
 
 @settings(max_examples=20, derandomize=True, deadline=None)

@@ -31,10 +31,10 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_both_runtimes_answer_alike_and_the_conversion_is_kept(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(kept))
     networks, model, renderer = load_networks("lite"), bracket(), Renderer()
-    truth = Pose(view_rotation([0.5, -1.0, 0.6]), [0.05, 0.0, 0.7]) @ model.T_obj_ctr.inverse()
+    truth = Pose(view_rotation([0.5, -1.0, 0.6]), [0.05, 0.0, 0.7]) @ model.T_ctr_obj
     start = Pose(so3_exp([0.05, 0.02, -0.04]) @ truth.R, truth.t + [0.004, 0.0, 0.01])
     [drawn] = renderer.render(model, [truth], CAMERA)
-    view, outline = View(drawn.image, CAMERA, drawn.mask), model.outline - model.center
+    view, outline = View(drawn.image, CAMERA, drawn.mask), model.hull_ctr
     results = []
     runtimes = [NetworkPredictor(networks, bfloat16=False), *(OpenVinoPredictor(networks, b, 1) for b in (False, True))]
     for predictor in runtimes:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from conftest import differences, moved
-from posekit.align.pnp import PnpConfig, projection_jacobian, solve_pnp
+from posekit.align.gauss_newton import projection_jacobian
+from posekit.align.pnp import PnpConfig, solve_pnp
 from posekit.camera import Camera
 from posekit.geometry import Pose, rotation_angle, so3_exp
 

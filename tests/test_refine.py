@@ -84,9 +84,9 @@ def renderer() -> Renderer:
 @pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (0.3, -0.2, 0.5)])
 def test_an_oracle_brings_refine_to_the_truth_in_one_step(renderer, update, place, offset) -> None:
     model = bracket(offset)
-    truth = Pose(view_rotation([0.5, -1.0, 0.6]), place) @ model.T_obj_ctr.inverse()
+    truth = Pose(view_rotation([0.5, -1.0, 0.6]), place) @ model.T_ctr_obj
     rng = np.random.default_rng(4)
-    start = PoseNoise().disturb(truth @ model.T_obj_ctr, rng) @ model.T_obj_ctr.inverse()
+    start = PoseNoise().disturb(truth @ model.T_obj_ctr, rng) @ model.T_ctr_obj
     assert errors(start, truth)[0] > 5
     options = RefineOptions(update=update, stop="fixed", iterations=1)
     found = refine(photograph(renderer, model, truth), model, [start], Oracle(model, truth), renderer, options)[0]
@@ -104,7 +104,7 @@ class Biased(Oracle):
     def _one(self, observed: View, rendered: View) -> PairPrediction:
         right = super()._one(observed, rendered)
         target = Pose.rotation(observed.R_view_cam) @ self.truth @ self.model.T_obj_ctr
-        mask = RENDERER.render(self.model, [target @ self.model.T_obj_ctr.inverse()], rendered.camera)[0].mask
+        mask = RENDERER.render(self.model, [target @ self.model.T_ctr_obj], rendered.camera)[0].mask
         assert mask is not None and right.correspondences is not None and rendered.coords is not None
         share = cv2.resize(mask.astype(np.float32), (40, 30), interpolation=cv2.INTER_AREA)
         found, wrong = right.correspondences, Pose(so3_exp(self.turn) @ target.R, target.t)
@@ -115,14 +115,14 @@ class Biased(Oracle):
 
 def test_the_outline_mends_what_correspondences_get_wrong(renderer) -> None:
     model = bracket()
-    truth = Pose(view_rotation([0.5, -1.0, 0.6]), PLACES[0]) @ model.T_obj_ctr.inverse()
+    truth = Pose(view_rotation([0.5, -1.0, 0.6]), PLACES[0]) @ model.T_ctr_obj
     rng = np.random.default_rng(0)
     view = photograph(renderer, model, truth)
     noise = rng.integers(150, 200, view.image.shape).astype(np.uint8)
     view = View(np.where(view.mask[..., None], view.image, noise), CAMERA)
     turns = []
     for outline in (False, True):
-        options = RefineOptions(stop="fixed", iterations=4, outline=outline)
+        options = RefineOptions(stop="fixed", iterations=4, colour_edge=outline)
         turns.append(
             errors(refine(view, model, [truth], Biased(model, truth), renderer, options)[0].T_cam_obj, truth)[0]
         )
@@ -131,7 +131,7 @@ def test_the_outline_mends_what_correspondences_get_wrong(renderer) -> None:
 
 def test_the_predicted_angle_stops_the_loop(renderer) -> None:
     model = bracket()
-    truth = Pose(view_rotation([0.5, -1.0, 0.6]), PLACES[0]) @ model.T_obj_ctr.inverse()
+    truth = Pose(view_rotation([0.5, -1.0, 0.6]), PLACES[0]) @ model.T_ctr_obj
     start = Pose(so3_exp([0, 0, 0.3]) @ truth.R, truth.t)
     found = refine(photograph(renderer, model, truth), model, [start, truth], Oracle(model, truth), renderer)
     assert [f.iterations for f in found] == [2, 1] and all(f.converged for f in found)
@@ -140,7 +140,7 @@ def test_the_predicted_angle_stops_the_loop(renderer) -> None:
 
 def test_a_small_angle_beside_a_large_correction_is_no_convergence(renderer) -> None:
     model = bracket()
-    truth = Pose(view_rotation([0.5, -1.0, 0.6]), PLACES[0]) @ model.T_obj_ctr.inverse()
+    truth = Pose(view_rotation([0.5, -1.0, 0.6]), PLACES[0]) @ model.T_ctr_obj
     start = Pose(so3_exp([0, 0, 0.3]) @ truth.R, truth.t)
     view, oracle = photograph(renderer, model, truth), Oracle(model, truth, angles=[0.01])
     found = refine(view, model, [start], oracle, renderer)[0]
@@ -160,7 +160,7 @@ class Wandering(Oracle):
 
 def test_a_pose_at_rest_ends_the_loop(renderer) -> None:
     model = bracket()
-    truth = Pose(view_rotation([0.5, -1.0, 0.6]), PLACES[0]) @ model.T_obj_ctr.inverse()
+    truth = Pose(view_rotation([0.5, -1.0, 0.6]), PLACES[0]) @ model.T_ctr_obj
     start = Pose(so3_exp([0, 0, 0.3]) @ truth.R, truth.t)
     oracle = Oracle(model, truth, angles=[0.5, 0.5])
     found = refine(photograph(renderer, model, truth), model, [start], oracle, renderer)[0]
@@ -169,7 +169,7 @@ def test_a_pose_at_rest_ends_the_loop(renderer) -> None:
 
 def test_without_convergence_the_lowest_predicted_angle_wins(renderer) -> None:
     model = bracket()
-    truth = Pose(view_rotation([0.5, -1.0, 0.6]), PLACES[0]) @ model.T_obj_ctr.inverse()
+    truth = Pose(view_rotation([0.5, -1.0, 0.6]), PLACES[0]) @ model.T_ctr_obj
     oracle = Wandering(model, truth, angles=[0.5, 0.2, 0.4, 0.3])
     options = RefineOptions(iterations=4, last_update=False)
     found = refine(photograph(renderer, model, truth), model, [truth], oracle, renderer, options)[0]
@@ -179,7 +179,7 @@ def test_without_convergence_the_lowest_predicted_angle_wins(renderer) -> None:
 
 def test_patience_ends_a_loop_that_no_longer_improves(renderer) -> None:
     model = bracket()
-    truth = Pose(view_rotation([0.5, -1.0, 0.6]), PLACES[0]) @ model.T_obj_ctr.inverse()
+    truth = Pose(view_rotation([0.5, -1.0, 0.6]), PLACES[0]) @ model.T_ctr_obj
     oracle = Wandering(model, truth, angles=[0.5, 0.2, 0.4, 0.3, 0.1, 0.3, 0.3, 0.3, 0.01])
     options = RefineOptions(patience=3)
     found = refine(photograph(renderer, model, truth), model, [truth], oracle, renderer, options)[0]
@@ -203,7 +203,7 @@ def test_what_went_on_does_not_forget_a_better_pose(stop: str, later_angle: floa
 
 def test_the_fixed_policy_takes_the_last_iterate(renderer) -> None:
     model = bracket()
-    truth = Pose(view_rotation([0.5, -1.0, 0.6]), PLACES[0]) @ model.T_obj_ctr.inverse()
+    truth = Pose(view_rotation([0.5, -1.0, 0.6]), PLACES[0]) @ model.T_ctr_obj
     oracle = Oracle(model, truth, angles=[0.001, 0.2, 0.4])
     options = RefineOptions(stop="fixed", iterations=3)
     found = refine(photograph(renderer, model, truth), model, [truth], oracle, renderer, options)[0]
@@ -212,7 +212,7 @@ def test_the_fixed_policy_takes_the_last_iterate(renderer) -> None:
 
 def test_an_update_that_the_predictor_cannot_give_is_refused(renderer) -> None:
     model = bracket()
-    truth = Pose(view_rotation([0.5, -1.0, 0.6]), PLACES[0]) @ model.T_obj_ctr.inverse()
+    truth = Pose(view_rotation([0.5, -1.0, 0.6]), PLACES[0]) @ model.T_ctr_obj
     oracle = Oracle(model, truth)
     oracle.dense = False
     with pytest.raises(ConfigError, match="the update is regression"):
@@ -236,7 +236,7 @@ def test_a_side_of_the_picture_does_not_bias_the_rotation(renderer) -> None:
     crops = []
     for ray in ([0.0, 0.0, 1.0], [0.45, -0.3, 1.0]):
         turn = rotation_between([0.0, 0.0, 1.0], ray)
-        truth = Pose.rotation(turn) @ centred @ model.T_obj_ctr.inverse()
+        truth = Pose.rotation(turn) @ centred @ model.T_ctr_obj
         oracle = Recorder(model, truth)
         view = photograph(renderer, model, truth)
         found = refine(view, model, [truth], oracle, renderer, RefineOptions(stop="fixed", iterations=1))[0]

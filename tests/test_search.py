@@ -147,8 +147,8 @@ class Fixed:
     def __init__(self, scores: Sequence[float], boxes: Sequence[tuple[float, float, float, float]] = BOXES) -> None:
         self.scores, self.asked = dict(zip(boxes, scores, strict=False)), []  # type: ignore[var-annotated]
 
-    def estimate(self, view: View, detections: Sequence[Detection], least: float = 0.0) -> list[Estimate]:
-        self.asked.append(least)
+    def estimate(self, view: View, detections: Sequence[Detection], min_score: float = 0.0) -> list[Estimate]:
+        self.asked.append(min_score)
         return [
             Estimate(Pose.identity(), 0.0, 1, True, self.scores[d.box], d.box, "m", d)
             for d in detections
@@ -167,9 +167,9 @@ def kept(fixed: Fixed, source: Source, options: SearchOptions | None = None) -> 
 
 def test_instances_are_what_scores_and_does_not_overlap() -> None:
     fixed = Fixed([0.6, 0.8, 0.5, 0.1])
-    assert kept(fixed, Source.BOX, SearchOptions(instances=0, least=0.3)) == [0.8, 0.5]
-    assert kept(fixed, Source.BOX, SearchOptions(instances=1, least=0.3)) == [0.8]
-    assert kept(fixed, Source.BOX, SearchOptions(least=0.9)) == []
+    assert kept(fixed, Source.BOX, SearchOptions(instances=0, min_score=0.3)) == [0.8, 0.5]
+    assert kept(fixed, Source.BOX, SearchOptions(instances=1, min_score=0.3)) == [0.8]
+    assert kept(fixed, Source.BOX, SearchOptions(min_score=0.9)) == []
     assert box_overlap(BOXES[0], BOXES[1]) == pytest.approx(9 / 11)
     assert box_overlap(BOXES[0], BOXES[2]) == 0 and box_overlap(BOXES[0], (0, 20, 10, 30)) == 0
 
@@ -182,7 +182,7 @@ def test_what_is_kept_depends_on_who_says_where_the_object_is() -> None:
     assert kept(fixed, Source.NOVEL) == kept(fixed, Source.TRAINED) == [0.8], "the best one, borne out"
     assert SearchOptions.usual([]) == SearchOptions()
     assert SearchOptions.usual([Detection(BOXES[0]), Detection(BOXES[1], source=Source.FILE)]).overlap == 0.5
-    assert SearchOptions.usual([Detection(BOXES[0]), Detection(BOXES[1], source=Source.TRAINED)]).least == 0.5
+    assert SearchOptions.usual([Detection(BOXES[0]), Detection(BOXES[1], source=Source.TRAINED)]).min_score == 0.5
 
 
 def test_a_detection_belongs_to_the_model_of_its_label() -> None:
@@ -222,8 +222,8 @@ def test_the_tracker_asks_what_the_others_ask(score: float, state: str) -> None:
     class Placed(Fixed):
         model = MODEL
 
-        def estimate(self, view: View, detections: Sequence[Detection], least: float = 0.0) -> list[Estimate]:
-            return [dataclasses.replace(e, T_cam_obj=place) for e in fixed.estimate(view, detections, least)]
+        def estimate(self, view: View, detections: Sequence[Detection], min_score: float = 0.0) -> list[Estimate]:
+            return [dataclasses.replace(e, T_cam_obj=place) for e in fixed.estimate(view, detections, min_score)]
 
     from posekit.render import Renderer
 

@@ -336,7 +336,10 @@ def test_rooms_are_traced_where_masks_are(tmp_path: Path, renderer: Renderer) ->
             assert drawn.depth is not None
             np.testing.assert_allclose(traced[inner], drawn.depth[inner], atol=2e-4)
             seen += int(inner.sum())
-            assert model.bounds[0] is not None and T_world_obj[instance.obj_id].apply(model.outline)[:, 2].min() > -1e-6
+            assert (
+                model.bounds[0] is not None
+                and T_world_obj[instance.obj_id].apply(model.hull_vertices)[:, 2].min() > -1e-6
+            )
     assert seen > 100
     again = make(tmp_path / "again", what)
     assert digest(again.root) == digest(data.root)
@@ -381,7 +384,7 @@ def test_things_dropped_come_to_rest() -> None:
 
     models = [bracket(), *objects().values()]
     poses = drop(models, np.random.default_rng(1), 0.1)
-    lowest = [pose.apply(model.outline)[:, 2].min() for pose, model in zip(poses, models, strict=True)]
+    lowest = [pose.apply(model.hull_vertices)[:, 2].min() for pose, model in zip(poses, models, strict=True)]
     assert min(lowest) > -1e-6 and min(lowest) < 0.005
     again = drop(models, np.random.default_rng(1), 0.1)
     assert all(np.array_equal(a.matrix, b.matrix) for a, b in zip(poses, again, strict=True))

@@ -53,7 +53,7 @@ def test_objects_rest_on_a_facet() -> None:
     rng = np.random.default_rng(1)
     model = bracket()
     for _ in range(20):
-        points = (model.outline - model.center) @ resting_rotation(model, rng).T
+        points = (model.hull_ctr) @ resting_rotation(model, rng).T
         lowest = points[:, 2] < points[:, 2].min() + 1e-6
         assert lowest.sum() >= 3, "it balances on a corner"
         low, high = points[lowest, :2].min(0), points[lowest, :2].max(0)

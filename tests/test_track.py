@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 from bop_scene import write_scene
 from objects import bracket, cuboid
 from posekit.align.colour_edge import Tint, learn, off_colour, outline_lines
-from posekit.align.fusion import Belief, Points, fuse
+from posekit.align.gauss_newton import GaussianPose, Points, fuse
 from posekit.camera import Camera
 from posekit.cli.app import app
 from posekit.errors import CameraError, ConfigError, OutputError
@@ -31,7 +31,7 @@ from posekit.metrics import pose_error
 from posekit.render import Renderer
 from posekit.results import Detection, Estimate
 from posekit.synth.example import Example, make_example, ply
-from posekit.tracking.points import Look, follow_points, match_texture
+from posekit.tracking.points import Keyframe, follow_points, match_texture
 from posekit.tracking.tracker import LOST, RESTARTED, TRACKED, TrackConfig, Tracker
 from posekit.view import View
 from posekit.visualise.recording import Recorder
@@ -54,7 +54,7 @@ def model() -> ObjectModel:
 def path(model: ObjectModel, k: float) -> Pose:
     """Two degrees and 3 mm a frame about the centre."""
     R = so3_exp([0.0, 0.035 * k, 0.01 * k]) @ view_rotation([0.5, -1.0, 0.6])
-    return Pose(R, [0.003 * k - 0.05, 0.0, 0.6]) @ model.T_obj_ctr.inverse()
+    return Pose(R, [0.003 * k - 0.05, 0.0, 0.6]) @ model.T_ctr_obj
 
 
 def backdrop() -> np.ndarray:
@@ -76,7 +76,7 @@ class Estimator:
     def __init__(self, model: ObjectModel, renderer: Renderer, found: Pose | None = None, score: float = 0.9) -> None:
         self.model, self.renderer, self.found, self.score = model, renderer, found, score
 
-    def estimate(self, view: View, detections: Sequence[Detection], least: float = 0.0) -> list[Estimate]:
+    def estimate(self, view: View, detections: Sequence[Detection], min_score: float = 0.0) -> list[Estimate]:
         if self.found is None:
             return []
         return [Estimate(self.found, 0.1, 3, True, self.score, d.box, self.model.name, d) for d in detections]
@@ -108,10 +108,10 @@ def test_an_oracle_is_followed(model: ObjectModel, renderer: Renderer, motion: s
         assert found.estimate.score > 0.8 and set(found.estimate.timings) == {"network", "total"}
 
 
-def looked(view: View, model: ObjectModel, renderer: Renderer, pose: Pose) -> Look:
-    [seen], [drawn] = crops(view, model, model.outline - model.center, [pose], (160, 120), renderer)
+def looked(view: View, model: ObjectModel, renderer: Renderer, pose: Pose) -> Keyframe:
+    [seen], [drawn] = crops(view, model, model.hull_ctr, [pose], (160, 120), renderer)
     T_view_ctr = Pose.rotation(seen.R_view_cam) @ pose @ model.T_obj_ctr
-    return Look(seen, drawn, T_view_ctr, np.ones((120, 160), bool))
+    return Keyframe(seen, drawn, T_view_ctr, np.ones((120, 160), bool))
 
 
 def test_followed_points_alone_carry_a_pose(model: ObjectModel, renderer: Renderer) -> None:
@@ -122,9 +122,9 @@ def test_followed_points_alone_carry_a_pose(model: ObjectModel, renderer: Render
         start = Pose.rotation(drawn.seen.R_view_cam) @ path(model, 0) @ model.T_obj_ctr
         points = follow_points(drawn, start, drawn.again(after), model)
         assert points is not None and len(points.points) > 20
-        found = fuse(start, [Belief.about(start, drawn.drawn.camera, 1.0, 50.0, 0.5), points], drawn.drawn.camera)
+        found = fuse(start, [GaussianPose.about(start, drawn.drawn.camera, 1.0, 50.0, 0.5), points], drawn.drawn.camera)
         assert found is not None
-        pose = Pose.rotation(drawn.seen.R_view_cam.T) @ found.pose @ model.T_obj_ctr.inverse()
+        pose = Pose.rotation(drawn.seen.R_view_cam.T) @ found.pose @ model.T_ctr_obj
         still, moved = pose_error(path(model, 0), path(model, 1)), pose_error(pose, path(model, 1))
         assert moved[0] < 0.35 * still[0] and moved[1] < 0.35 * still[1]
     flat = View(np.full_like(after.image, 128), CAMERA)
@@ -147,10 +147,10 @@ def test_texture_leads_from_the_drawn_mesh_to_the_frame(renderer: Renderer) -> N
         at = looked(shown, model, renderer, path(model, 0.6))
         points = match_texture(at, model)
         assert points is not None
-        prior = Belief.about(at.T_view_ctr, at.drawn.camera, 0.2, 10.0, 0.1)
+        prior = GaussianPose.about(at.T_view_ctr, at.drawn.camera, 0.2, 10.0, 0.1)
         found = fuse(at.T_view_ctr, [prior, points], at.drawn.camera)
         assert found is not None
-        pose = Pose.rotation(at.seen.R_view_cam.T) @ found.pose @ model.T_obj_ctr.inverse()
+        pose = Pose.rotation(at.seen.R_view_cam.T) @ found.pose @ model.T_ctr_obj
         before, after = (pose_error(p, path(model, 0)) for p in (path(model, 0.6), pose))
         assert after[0] < 0.5 * before[0] and after[1] < 0.5 * before[1]
     noise = np.random.default_rng(2).integers(0, 255, (480, 640, 3)).astype(np.uint8)
@@ -178,10 +178,10 @@ def test_an_outline_is_found_by_its_colours(model: ObjectModel, renderer: Render
     lines = outline_lines(beside.seen, beside.drawn, colours, colours.seen(beside.seen), model.center)
     assert lines is not None and len(lines.points) > 60
     np.testing.assert_allclose(np.linalg.norm(lines.normals, axis=1), 1, atol=1e-5)
-    prior = Belief.about(beside.T_view_ctr, beside.drawn.camera, 0.2, 10.0, 0.1)
+    prior = GaussianPose.about(beside.T_view_ctr, beside.drawn.camera, 0.2, 10.0, 0.1)
     found = fuse(beside.T_view_ctr, [prior, lines], beside.drawn.camera)
     assert found is not None
-    pose = Pose.rotation(beside.seen.R_view_cam.T) @ found.pose @ model.T_obj_ctr.inverse()
+    pose = Pose.rotation(beside.seen.R_view_cam.T) @ found.pose @ model.T_ctr_obj
     turn, shift = pose_error(pose, path(model, 0))
     assert np.rad2deg(turn) < 0.7 and shift < 0.002
 
@@ -239,7 +239,7 @@ def test_what_is_suddenly_of_another_colour_hides_the_object(model: ObjectModel,
 def test_beliefs_are_weighed_by_their_information() -> None:
     camera = Camera(200.0, 200.0, 79.5, 59.5, 160, 120)
     a, b = Pose(np.eye(3), [0.0, 0.0, 1.0]), Pose(so3_exp([0.0, 0.02, 0.0]), [0.03, 0.0, 1.0])
-    firm, loose = (Belief.about(pose, camera, turn, 2.0, 0.05) for pose, turn in ((a, 0.01), (b, 0.02)))
+    firm, loose = (GaussianPose.about(pose, camera, turn, 2.0, 0.05) for pose, turn in ((a, 0.01), (b, 0.02)))
     found = fuse(a, [firm, loose], camera)
     assert found is not None
     assert rotation_angle(found.pose.R) == pytest.approx(0.02 / 5, rel=1e-3)  # information 4 to 1
@@ -260,7 +260,7 @@ def test_outliers_lose_their_weight() -> None:
     pixels = camera.project(truth.apply(points))
     pixels[:15] += rng.uniform(10, 30, (15, 2))
     start = Pose(np.eye(3), [0.0, 0.0, 0.62])
-    terms = [Belief.about(start, camera, 1.0, 50.0, 1.0), Points(points, pixels, np.ones(60), np.full(60, 0.3))]
+    terms = [GaussianPose.about(start, camera, 1.0, 50.0, 1.0), Points(points, pixels, np.ones(60), np.full(60, 0.3))]
     found = fuse(start, terms, camera, steps=20)
     assert found is not None
     turn, shift = pose_error(found.pose, truth)

@@ -25,7 +25,7 @@ CAMERA = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
 
 def black_backdrop() -> tuple[View, Pose]:
     model = bracket()
-    truth = Pose(view_rotation([0.5, -1.0, 0.6]), np.array([0.0, 0.0, 0.6])) @ model.T_obj_ctr.inverse()
+    truth = Pose(view_rotation([0.5, -1.0, 0.6]), np.array([0.0, 0.0, 0.6])) @ model.T_ctr_obj
     [drawn] = Renderer().render(model, [truth], CAMERA)
     assert drawn.mask is not None
     return View(np.where(drawn.mask[..., None], drawn.image, 0).astype(np.uint8), CAMERA, drawn.mask), truth
@@ -58,7 +58,7 @@ def test_an_object_before_black_keeps_its_outline() -> None:
     """From a pose beside the truth, the outline's lines end where the true outline is."""
     view, truth = black_backdrop()
     model, renderer = bracket(), Renderer()
-    outline, size = model.outline - model.center, (160, 120)
+    outline, size = model.hull_ctr, (160, 120)
     start = Pose(truth.R, truth.t + [0.002, 0.0, 0.0])
     [seen], [drawn] = crops(View(view.image, CAMERA), model, outline, [start], size, renderer)
     assert drawn.mask is not None
@@ -76,9 +76,7 @@ def test_an_object_before_black_keeps_its_outline() -> None:
 def test_black_surroundings_teach_their_colour_and_black_parts_are_followed() -> None:
     view, truth = black_backdrop()
     model, renderer = bracket(), Renderer()
-    [seen], [drawn] = crops(
-        View(view.image, CAMERA), model, model.outline - model.center, [truth], (160, 120), renderer
-    )
+    [seen], [drawn] = crops(View(view.image, CAMERA), model, model.hull_ctr, [truth], (160, 120), renderer)
     assert drawn.mask is not None
     colours = learn(seen, drawn.mask, np.ones_like(drawn.mask))
     assert colours.outside[0] > 0.1, "black is the ground's"

@@ -13,7 +13,7 @@ from posekit.zoom import box_window, frontal_camera, frontal_pose, zoom_to_box, 
 
 CAMERA = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
 MODEL = bracket()
-HULL = MODEL.outline - MODEL.center
+HULL = MODEL.hull_ctr
 POSE = Pose(view_rotation([0.5, -1.0, 0.6]), np.array([0.1, -0.05, 0.7]))
 
 

@@ -58,9 +58,7 @@ class Result(Sequence[Estimate]):
     def best(self) -> Estimate:
         """The first estimate. Raises PromptError where nothing was found."""
         if not self.estimates:
-            raise PromptError(
-                f"nothing in the picture could be taken for {self.estimator.model.name}: give a box or a mask of it."
-            )
+            raise PromptError(f"{self.estimator.model.name} not found: give a box or a mask of it.")
         return self.estimates[0]
 
     @property
@@ -204,7 +202,7 @@ def _found(
         return MaskPrompt(_mask_of(mask, view.lens)).detect(view, [estimator.model])
     from posekit.detect.novel import make_detector
 
-    finder, _ = make_detector(None, [estimator.model], most=CANDIDATES, doubtful=True)
+    finder, _ = make_detector(None, [estimator.model], max_detections=CANDIDATES, doubtful=True)
     return finder.detect(view, [estimator.model])
 
 

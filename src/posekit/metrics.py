@@ -111,8 +111,8 @@ def proj2d(estimated: Poses, truth: Poses, camera: Cameras, points: ArrayLike) -
 def mssd(estimated: Poses, truth: Poses, points: ArrayLike, symmetries: Sequence[Pose] = _ALONE) -> Array:
     """BOP's maximum symmetry-aware surface distance, metres.
 
-    points: (P, 3); the convex hull's corners (`ObjectModel.outline`) give the same result as all vertices, because
-    the distance is a convex function of the point.
+    points: (P, 3); the convex hull's corners (`ObjectModel.hull_vertices`) give the same result as all vertices,
+    because the distance is a convex function of the point.
     """
     est, gt = np.broadcast_arrays(_matrices(estimated), _matrices(truth))
 

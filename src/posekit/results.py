@@ -89,8 +89,8 @@ class Estimate:
     """An object's pose in a photograph.
 
     angle: the rotation error, radians, that the network predicts for T_cam_obj itself; for a tracked frame, for the
-    pose at which the frame was compared. contour_std: where the pose was laid onto an exact mask's outline, the
-    standard deviation of its rotation, radians. iterations: used for this result. converged: whether contour_std, or
+    pose at which the frame was compared. mask_edge_std: where the pose was laid onto an exact mask's outline, the
+    standard deviation of its rotation, radians. iterations: used for this result. converged: whether mask_edge_std, or
     else the angle, is below the threshold. branch: None for an object without symmetries. score: in [0, 1], how likely
     the object is there in this pose. box: of the object at this pose, edges, pixels. model: the mesh's name.
     detection: what it started from. trace: the poses on the way, first to last. timings: seconds by stage.
@@ -107,7 +107,7 @@ class Estimate:
     detection: Detection | None = None
     trace: tuple[Step, ...] = ()
     timings: Mapping[str, float] = field(default_factory=dict)
-    contour_std: float | None = None
+    mask_edge_std: float | None = None
     branch: Branch | None = None
     alternatives: tuple[Estimate, ...] = ()
 
@@ -192,7 +192,7 @@ def _estimate_to_dict(estimate: Estimate) -> dict[str, Any]:
         "reliable": estimate.reliable,
         "angle_deg": estimate.angle_deg,
         "iterations": estimate.iterations,
-        "contour_std_deg": None if estimate.contour_std is None else math.degrees(estimate.contour_std),
+        "contour_std_deg": None if estimate.mask_edge_std is None else math.degrees(estimate.mask_edge_std),
         "converged": estimate.converged,
         "branch": None if estimate.branch is None else estimate.branch.value,
         "score": estimate.score,
@@ -221,7 +221,7 @@ def _estimate_from_dict(entry: Mapping[str, Any]) -> Estimate:
         and Detection(_box(found["box"]), None, _number(found["score"]), found["label"], Source(found["source"])),
         trace=tuple(Step(Pose.from_matrix(s["T_cam_obj"]), _radians(s["angle_deg"])) for s in entry["trace"]),
         timings={stage: _number(seconds) for stage, seconds in entry["timings_s"].items()},
-        contour_std=None if entry.get("contour_std_deg") is None else _radians(entry["contour_std_deg"]),
+        mask_edge_std=None if entry.get("contour_std_deg") is None else _radians(entry["contour_std_deg"]),
         branch=None if entry.get("branch") is None else Branch(entry["branch"]),
         alternatives=tuple(_estimate_from_dict(other) for other in entry.get("alternatives", ())),
     )

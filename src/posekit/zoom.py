@@ -64,7 +64,7 @@ def frontal_camera(model: ObjectModel, size: tuple[int, int]) -> tuple[Camera, f
     distance = 5.0 * model.diameter
     frontal = Pose(cube_views()[0], np.array([0, 0, distance]))
     whole = Camera.from_fov(1.0, *size)
-    return zoom_to_pose(whole, frontal, model.outline - model.center, size, enlarge=1.0).camera, distance
+    return zoom_to_pose(whole, frontal, model.hull_ctr, size, enlarge=1.0).camera, distance
 
 
 def frontal_pose(camera: Camera, distance: float, crop_camera: Camera) -> Pose:

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from posekit.align.fusion import Lines
+from posekit.align.gauss_newton import Lines
 from posekit.view import View
 
 Array = NDArray[np.float64]

@@ -7,21 +7,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from posekit.align.gauss_newton import NEAREST, Equations, cauchy, normal_equations, projection_jacobian, solve
 from posekit.camera import Camera
-from posekit.geometry import Pose, nearest_rotation, so3_exp
+from posekit.geometry import Pose
 
 Array = NDArray[np.float64]
+
+STILL = 1e-7  # a step in radians, or in distances of the object, that ends the loop
 
 
 @dataclass(frozen=True)
 class PnpConfig:
-    """iterations: Gauss-Newton steps. knee: residual, in predicted standard deviations, at which a point loses half
-    of its weight (Cauchy). prior: how strongly a step is damped, as a share of the Hessian's diagonal."""
+    """How `solve_pnp` works."""
 
-    iterations: int = 12
-    knee: float = 2.5
-    prior: float = 1e-3
-    min_points: int = 12
+    iterations: int = 12  # Gauss-Newton steps
+    knee: float = 2.5  # residual, in predicted standard deviations, at which a point loses half of its weight (Cauchy)
+    damping: float = 1e-3  # of a step, as a share of the normal matrix's diagonal
+    min_points: int = 12  # with a weight above 0.1
 
 
 def solve_pnp(
@@ -46,39 +48,16 @@ def solve_pnp(
     visible, sigma = np.asarray(weight, dtype=np.float64), np.asarray(scale_px, dtype=np.float64)
     if (visible > 0.1).sum() < config.min_points:
         return None
-    R, t = start.R, start.t
-    for _ in range(config.iterations):
-        p = X @ R.T
-        q = p + t
-        if q[:, 2].min() < 1e-3:
-            return None
-        residual = (camera.project(q) - target) / sigma[:, None]
-        size = np.linalg.norm(residual, axis=1)
-        knee = max(config.knee, 1.5 * float(np.median(size)))
-        w = visible / (1 + (size / knee) ** 2) / sigma**2
-        J = projection_jacobian(p, q, camera)  # (N, 2, 6)
-        weighted = J * w[:, None, None]
-        H = np.einsum("nij,nik->jk", weighted, J)
-        g = np.einsum("nij,ni->j", weighted, residual * sigma[:, None])
-        step = -np.linalg.solve(H + config.prior * np.diag(np.diag(H)) + 1e-12 * np.eye(6), g)
-        R, t = so3_exp(step[:3]) @ R, t + step[3:]
-        if not np.isfinite(t).all() or t[2] < 1e-3:
-            return None
-        if np.abs(step[:3]).max() < 1e-6 and np.abs(step[3:]).max() < 1e-7:
-            break
-    return Pose(nearest_rotation(R), t)
 
+    def equations(pose: Pose, _: Array) -> Equations | None:
+        p = X @ pose.R.T
+        q = p + pose.t
+        if q[:, 2].min() < NEAREST:
+            return None
+        residual = camera.project(q) - target
+        w = visible * cauchy(np.linalg.norm(residual, axis=1) / sigma, config.knee) / sigma**2
+        normal, right = normal_equations(projection_jacobian(p, q, camera), residual, w)
+        return normal + config.damping * np.diag(np.diag(normal)) + 1e-12 * np.eye(6), right
 
-def projection_jacobian(p: Array, q: Array, camera: Camera) -> Array:
-    """d project(exp(w) p + t) / d(w, t) at zero; p: (N, 3) rotated points, q = p + t -> (N, 2, 6)."""
-    x, y, z = p.T
-    depth = q[:, 2]
-    right, down = camera.fx / depth, camera.fy / depth
-    across, along = -right * q[:, 0] / depth, -down * q[:, 1] / depth
-    none = np.zeros(len(q))
-    # a row d of the derivative by t gives p x d by w
-    rows = [
-        [y * across, z * right - x * across, -y * right, right, none, across],
-        [y * along - z * down, -x * along, x * down, none, down, along],
-    ]
-    return np.array(rows).transpose(2, 0, 1)
+    found = solve(start, equations, steps=config.iterations, still=STILL)
+    return None if found is None else found.pose

@@ -23,10 +23,23 @@ from posekit.cli import demo, detect, doctor, download, estimate, eval, refine, 
 from posekit.errors import PosekitError
 
 INTERRUPTED = 130  # as shells count it: 128 + SIGINT
+RENAMED = {
+    "--least": "--min-score",
+    "--most": "--max-detections",
+    "--beside": "--perturb",
+    "--alone": "--no-perturb",
+    "--contour": "--mask-edge",
+    "--no-contour": "--no-mask-edge",
+    "--outline": "--colour-edge",
+    "--no-outline": "--no-colour-edge",
+}  # options that had other names in 0.1
 
 
 class Commands(TyperGroup):
     """Turns a PosekitError into one line on standard error and exit code 1, Ctrl-C into exit code 130."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        return list(super().parse_args(ctx, [_renamed(arg) for arg in args]))
 
     def invoke(self, ctx: Any) -> Any:
         try:
@@ -46,6 +59,15 @@ class Commands(TyperGroup):
                 raise
             _tell("error", _unexpected(error), typer.colors.RED)
             raise typer.Exit(1) from error
+
+
+def _renamed(arg: str) -> str:
+    """An argument with today's name of its option."""
+    name, equals, value = arg.partition("=")
+    if name not in RENAMED:
+        return arg
+    _tell("note", f"{name} is now called {RENAMED[name]}; the old name goes with the next release.", typer.colors.BLUE)
+    return RENAMED[name] + equals + value
 
 
 def _unexpected(error: Exception) -> str:

@@ -45,8 +45,13 @@ def detect(
     units: UnitsOption = "auto",
     camera: CameraOption = None,
     detector: DetectorOption = None,
-    least: Annotated[float | None, typer.Option(min=0, max=1, help="Least score.", rich_help_panel=SCORES)] = None,
-    most: Annotated[int, typer.Option(min=1, help="Detections of a mesh at most (novel).", rich_help_panel=SCORES)] = 3,
+    min_score: Annotated[
+        float | None,
+        typer.Option(min=0, max=1, help="Leave out detections with a lower score.", rich_help_panel=SCORES),
+    ] = None,
+    max_detections: Annotated[
+        int, typer.Option(min=1, help="Keep at most so many detections of a mesh (novel).", rich_help_panel=SCORES)
+    ] = 3,
     verify: Annotated[
         bool | None,
         typer.Option(
@@ -81,17 +86,17 @@ def detect(
     finder, classes = make_detector(
         detector,
         meshes,
-        least=None if verify else least,
-        most=most,
+        min_score=None if verify else min_score,
+        max_detections=max_detections,
         doubtful=bool(verify),
     )
     verify = isinstance(finder, NovelDetector) and bool(meshes) if verify is None else verify
-    if verify and isinstance(finder, NovelDetector):  # the poses are asked for the least score, not the looks
-        finder = NovelDetector(finder.detector, finder.renderer, NovelOptions(most=most))
+    if verify and isinstance(finder, NovelDetector):  # the poses are held to the minimum score, not the detections
+        finder = NovelDetector(finder.detector, finder.renderer, NovelOptions(max_detections=max_detections))
     started = time.perf_counter()
     found = sorted(finder.detect(view, meshes), key=lambda d: -d.score)
     if verify:
-        found = _verified(view, found, meshes, SearchOptions().least if least is None else least)
+        found = _verified(view, found, meshes, SearchOptions().min_score if min_score is None else min_score)
     seconds = time.perf_counter() - started
     for detection in found:
         typer.echo(
@@ -100,18 +105,20 @@ def detect(
         )
     if not found:
         names = ", ".join(m.name for m in meshes) or "an object"
-        typer.echo(f"nothing in the picture could be taken for {names}.")
+        typer.echo(f"{names} not found.")
     typer.echo(f"{len(found)} detections in {seconds:.2f} s")
     typer.echo(f"overlay: {folder.write('overlay.png', png(detections_overlay(view, found)))}")
     typer.echo(f"COCO: {folder.write('coco.json', to_coco(found, classes, image, view.camera.size))}")
     typer.echo(f"BOP: {folder.write('bop.json', to_bop(found, classes, image, seconds, scene))}")
 
 
-def _verified(view: View, found: Sequence[Detection], meshes: Sequence[ObjectModel], least: float) -> list[Detection]:
+def _verified(
+    view: View, found: Sequence[Detection], meshes: Sequence[ObjectModel], min_score: float
+) -> list[Detection]:
     """What a pose speaks for, best first, scored by it."""
     from posekit.estimate.estimator import Estimators
     from posekit.estimate.instances import SearchOptions, find_instances, judged
 
-    results = find_instances(Estimators(), view, meshes, found, SearchOptions(least=least))
-    kept = [d for each in results for d in judged(each) if d.score >= least]
+    results = find_instances(Estimators(), view, meshes, found, SearchOptions(min_score=min_score))
+    kept = [d for each in results for d in judged(each) if d.score >= min_score]
     return sorted(kept, key=lambda d: -d.score)

@@ -13,7 +13,7 @@ from posekit.cli.options import (
     BlendOption,
     BoxOption,
     CameraOption,
-    ContourOption,
+    ColourEdgeOption,
     DetectionsOption,
     DetectorOption,
     DeviceOption,
@@ -22,10 +22,10 @@ from posekit.cli.options import (
     ImageArgument,
     IterationsOption,
     JsonOption,
+    MaskEdgeOption,
     MaskFromOption,
     MaskOption,
     ModelsOption,
-    OutlineOption,
     OutOption,
     PresetOption,
     RequireReliableOption,
@@ -55,7 +55,7 @@ TopOption = Annotated[
 InstancesOption = Annotated[
     int, typer.Option(min=1, metavar="N", help="Of each mesh at most, where it is looked for.", rich_help_panel=LOOP)
 ]
-LeastOption = Annotated[
+MinScoreOption = Annotated[
     float | None,
     typer.Option(
         min=0,
@@ -76,7 +76,7 @@ def estimate(
     detections: DetectionsOption = None,
     detector: DetectorOption = None,
     instances: InstancesOption = 1,
-    least: LeastOption = None,
+    min_score: MinScoreOption = None,
     units: UnitsOption = "auto",
     symmetry: SymmetryOption = None,
     preset: PresetOption = "lite",
@@ -88,8 +88,8 @@ def estimate(
     stop: StopOption = "angle",
     iterations: IterationsOption = 50,
     stop_angle: StopAngleOption = 2.0,
-    contour: ContourOption = True,
-    outline: OutlineOption = True,
+    mask_edge: MaskEdgeOption = True,
+    colour_edge: ColourEdgeOption = True,
     threads: ThreadsOption = None,
     device: DeviceOption = "auto",
     out: OutOption = None,
@@ -112,7 +112,7 @@ def estimate(
 
     use_threads(threads)
     options = EstimateOptions(
-        init, hypotheses, update, stop, iterations, stop_angle, contour=contour, outline=outline, top=top
+        init, hypotheses, update, stop, iterations, stop_angle, mask_edge=mask_edge, colour_edge=colour_edge, top=top
     )
     view = load_view(image, camera)
     meshes = [ObjectModel.load(path, units=units, symmetry=symmetry) for path in model]
@@ -123,14 +123,14 @@ def estimate(
 
         with destination.working("loading the detector"):
             candidates = max(CANDIDATES, instances + 1)
-            finder, _ = make_detector(detector, meshes, most=candidates, doubtful=True)
+            finder, _ = make_detector(detector, meshes, max_detections=candidates, doubtful=True)
     with destination.working("detecting"):
         found = finder.detect(view, meshes)
     with destination.working("loading the networks"):
         estimators = Estimators(preset=preset, weights=weights, options=options, device=device)
     search = SearchOptions.usual(found)
     search = replace(search, instances=search.instances if asked else instances,
-                     least=search.least if least is None else least)  # fmt: skip
+                     min_score=search.min_score if min_score is None else min_score)  # fmt: skip
     with destination.working("estimating"):
         results = find_instances(estimators, view, meshes, found, search)
     paths = [{"image": image, "mesh": path} for path in model]

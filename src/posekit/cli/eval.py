@@ -13,11 +13,11 @@ from posekit.cli.estimate import HypothesesOption, InitOption
 from posekit.cli.options import (
     LOOP,
     OUTPUT,
-    BesideOption,
-    ContourOption,
+    ColourEdgeOption,
     DeviceOption,
     IterationsOption,
-    OutlineOption,
+    MaskEdgeOption,
+    PerturbOption,
     PresetOption,
     StopAngleOption,
     StopOption,
@@ -92,9 +92,9 @@ def evaluate(
     stop: StopOption = "angle",
     iterations: IterationsOption = 50,
     stop_angle: StopAngleOption = 2.0,
-    beside: BesideOption = True,
-    contour: ContourOption = True,
-    outline: OutlineOption = True,
+    perturb: PerturbOption = True,
+    mask_edge: MaskEdgeOption = True,
+    colour_edge: ColourEdgeOption = True,
     seed: Annotated[
         int,
         typer.Option(help="Of the refine stage's disturbances, and of --compare's bootstrap.", rich_help_panel=STAGE),
@@ -147,7 +147,9 @@ def evaluate(
         seed=seed,
         preset=preset,
         weights=weights,
-        estimate=EstimateOptions(init, hypotheses, update, stop, iterations, stop_angle, beside, contour, outline),
+        estimate=EstimateOptions(
+            init, hypotheses, update, stop, iterations, stop_angle, perturb, mask_edge, colour_edge
+        ),
         threads=threads,
         device=device,
         workers=workers,

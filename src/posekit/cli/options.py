@@ -85,27 +85,27 @@ IterationsOption = Annotated[int, typer.Option(help="At most; with --stop fixed 
 StopAngleOption = Annotated[
     float, typer.Option(metavar="DEGREES", help="Predicted angle that ends the loop.", rich_help_panel=LOOP)
 ]
-BesideOption = Annotated[
+PerturbOption = Annotated[
     bool,
     typer.Option(
-        "--beside/--alone",
-        help="Also try poses 12 degrees beside the given one where it does not converge at once.",
+        "--perturb/--no-perturb",
+        help="Also try poses turned by 12 degrees from the given one where that does not converge at once.",
         rich_help_panel=LOOP,
     ),
 ]
-ContourOption = Annotated[
+MaskEdgeOption = Annotated[
     bool,
     typer.Option(
-        "--contour/--no-contour",
-        help="Lay the final outline onto the mask's, where the mask proves exact to the pixel.",
+        "--mask-edge/--no-mask-edge",
+        help="Fit the pose to the edge of the given mask, where the mask proves exact to the pixel.",
         rich_help_panel=LOOP,
     ),
 ]
-OutlineOption = Annotated[
+ColourEdgeOption = Annotated[
     bool,
     typer.Option(
-        "--outline/--no-outline",
-        help="Lay poses onto the outline that the photograph's colours show, where no exact mask decides.",
+        "--colour-edge/--no-colour-edge",
+        help="Fit poses to the silhouette's edge as the photograph's colours show it, where no exact mask decides.",
         rich_help_panel=LOOP,
     ),
 ]

@@ -149,7 +149,7 @@ class Destination:
             for estimate in estimates:
                 self.say(describe(estimate))
             if not estimates:
-                self.say(f"no pose: nothing in the picture could be taken for {estimator.model.name}.")
+                self.say(f"{estimator.model.name} not found: no pose.")
             for note in limits(estimator.model, estimates):
                 log.info(note)
         about: dict[str, object] = dict(files[0])

@@ -68,23 +68,6 @@ def track(
             rich_help_panel=LOOP,
         ),
     ] = 0.0,
-    motion: Annotated[
-        Literal["points", "velocity", "none"],
-        typer.Option(help="What foretells the next pose: followed points, the last motion.", rich_help_panel=LOOP),
-    ] = "points",
-    mask: Annotated[
-        Literal["colours", "pose", "none"],
-        typer.Option(
-            help="What a frame's mask is taken to be: the silhouette's part of the object's colours, or all of it.",
-            rich_help_panel=LOOP,
-        ),
-    ] = "colours",
-    outline: Annotated[
-        bool, typer.Option(help="Whether the outline that the colours show counts.", rich_help_panel=LOOP)
-    ] = True,
-    texture: Annotated[
-        bool, typer.Option(help="Whether the mesh's texture in the frame counts.", rich_help_panel=LOOP)
-    ] = True,
     runtime: Annotated[
         Literal["openvino", "torch"], typer.Option(help="Of the network.", rich_help_panel=LOOP)
     ] = "openvino",
@@ -121,16 +104,7 @@ def track(
     if pose and len(pose) != len(model):
         raise PromptError(f"{len(pose)} --pose for {len(model)} --model: give one for each, in their order, or none.")
     use_threads(threads)
-    config = TrackConfig(
-        restart_angle,
-        still_angle,
-        iterations=iterations,
-        motion=motion,
-        mask=mask,
-        outline=outline,
-        texture=texture,
-        runtime=runtime,
-    )
+    config = TrackConfig(restart_angle, still_angle, iterations=iterations, runtime=runtime)
     starts = [load_pose(path) for path in pose] if pose else [None] * len(model)
     meshes = [ObjectModel.load(path, units=units, symmetry=symmetry) for path in model]
     sequence = ReadAhead(open_frames(source, camera), latest=live)

@@ -44,7 +44,7 @@ def detect_symmetries(renderer: Renderer, model: ObjectModel) -> Symmetries:
 
 def _seen(renderer: Renderer, model: ObjectModel, poses: list[Pose], camera: Camera) -> list[View]:
     """poses: T_cam_ctr."""
-    return renderer.render(model, [pose @ model.T_obj_ctr.inverse() for pose in poses], camera, light=None)
+    return renderer.render(model, [pose @ model.T_ctr_obj for pose in poses], camera, light=None)
 
 
 def _alike(before: list[View], after: list[View], depth: float) -> bool:

@@ -30,32 +30,31 @@ from posekit.view import View
 KIND = "mask-rcnn"
 NOVEL = ("object",)  # the one class of a class-agnostic detector
 SHIPPED = Path(__file__).resolve().parent.parent / "weights" / "detector-novel"
-Look = tuple[float, bool]  # at the picture: its size over the configuration's ``use_size``, and whether it is mirrored
-LOOKS: dict[str, tuple[Look, ...]] = {
+Augmentation = tuple[
+    float, bool
+]  # at the picture: its size over the configuration's ``use_size``, and whether it is mirrored
+AUGMENTATIONS: dict[str, tuple[Augmentation, ...]] = {
     "lite0": ((1.0, False), (4 / 3, False), (1.0, True), (4 / 3, True)),
     "resnet50": ((1.0, False),),
 }
-DOUBTFUL = 0.05  # score of a look's detections that may be joined with another look's
-SAME = 0.5  # intersection over union from which two looks' boxes are of one instance
+DOUBTFUL = 0.05  # score of an augmentation's detections that may be joined with another augmentation's
+SAME = 0.5  # intersection over union from which two augmentations' boxes are of one instance
 COCO = "coco"
 
 
 @dataclass(frozen=True)
 class MaskRCNNConfig:
-    """backbone: "lite0" or "resnet50". classes: names, without the ground. size: (width, height) that pictures are
-    fitted into in training. use_size: the same in use; small objects want it larger. channels: of the
-    pyramid. hidden: width of the box head. anchors: sides, one for each level of the pyramid, pixels. proposals:
-    regions kept in training and in use. samples: regions that the heads learn from in a picture."""
+    """The network of a detector and how it is used."""
 
-    backbone: str = "lite0"
-    classes: tuple[str, ...] = NOVEL
-    size: tuple[int, int] = (320, 240)
-    use_size: tuple[int, int] = (480, 360)
-    channels: int = 64
-    hidden: int = 256
-    anchors: tuple[int, ...] = (16, 32, 64, 128)
-    proposals: tuple[int, int] = (120, 120)
-    samples: int = 48
+    backbone: str = "lite0"  # "lite0" or "resnet50"
+    classes: tuple[str, ...] = NOVEL  # names, without the ground
+    size: tuple[int, int] = (320, 240)  # (width, height) that pictures are fitted into in training
+    use_size: tuple[int, int] = (480, 360)  # the same in use; small objects want it larger
+    channels: int = 64  # of the pyramid
+    hidden: int = 256  # width of the box head
+    anchors: tuple[int, ...] = (16, 32, 64, 128)  # sides, one for each level of the pyramid, pixels
+    proposals: tuple[int, int] = (120, 120)  # regions kept in training and in use
+    samples: int = 48  # regions that the heads learn from in a picture
 
     def __post_init__(self) -> None:
         if self.backbone not in BACKBONES:
@@ -220,16 +219,16 @@ def find(
     detector: TrainedDetector,
     image: NDArray[np.uint8],
     *,
-    least: float = 0.05,
-    most: int = 50,
+    min_score: float = 0.05,
+    max_detections: int = 50,
     size: tuple[int, int] | None = None,
 ) -> Found:
-    """Run the network on uint8 RGB (H, W, 3). least: score below which nothing is reported. most: detections. size:
-    (width, height) that the picture is fitted into, by default the configuration's ``use_size``."""
+    """Run the network on uint8 RGB (H, W, 3). min_score: score below which nothing is reported. size: (width, height)
+    that the picture is fitted into, by default the configuration's ``use_size``."""
     network = detector.network
     size = size or detector.config.use_size
     network.transform.min_size, network.transform.max_size = (min(size),), max(size)
-    network.roi_heads.score_thresh, network.roi_heads.detections_per_img = least, most
+    network.roi_heads.score_thresh, network.roi_heads.detections_per_img = min_score, max_detections
     pixels = torch.from_numpy(image).permute(2, 0, 1).float() / 255
     with torch.inference_mode():
         out = network([pixels])[0]
@@ -243,15 +242,24 @@ def find(
     )
 
 
-def find_in_looks(
-    detector: TrainedDetector, image: NDArray[np.uint8], looks: Sequence[Look], *, least: float, most: int = 50
+def find_augmented(
+    detector: TrainedDetector,
+    image: NDArray[np.uint8],
+    augmentations: Sequence[Augmentation],
+    *,
+    min_score: float,
+    max_detections: int = 50,
 ) -> Found:
-    """Look at a picture several times, and join what overlaps by half and has the same label: the mean of the scores
-    (0 from a look that does not see it), the boxes' mean weighted by score, the surest look's mask.
+    """Test-time augmentation: detections of several versions of a picture; what overlaps by half and has the same label
+    is joined: the mean of the scores (0 from a version without it), the boxes' mean weighted by score, the mask of the
+    highest score.
 
-    least: of the joined score. most: detections of a look. Raises ValueError without looks.
+    min_score: of the joined score. max_detections: of each version. Raises ValueError without augmentations.
     """
-    seen = [_look(detector, image, look, min(least, DOUBTFUL), most) for look in looks]
+    seen = [
+        _found_in(detector, image, augmentation, min(min_score, DOUBTFUL), max_detections)
+        for augmentation in augmentations
+    ]
     which = np.repeat(np.arange(len(seen)), [len(found.scores) for found in seen])
     boxes, labels, scores, masks = (
         np.concatenate([getattr(found, name) for found in seen]) for name in ("boxes", "labels", "scores", "masks")
@@ -263,38 +271,49 @@ def find_in_looks(
         same[0] = True  # even where it has no area
         groups.append(order[same])
         order = order[~same]
-    means = np.array([_mean_of_looks(scores[group], which[group], len(looks)) for group in groups])
-    kept = [groups[k] for k in np.argsort(-means, kind="stable") if means[k] >= least]
+    means = np.array([_mean_score(scores[group], which[group], len(augmentations)) for group in groups])
+    kept = [groups[k] for k in np.argsort(-means, kind="stable") if means[k] >= min_score]
     first = [group[0] for group in kept]
     return Found(
         np.array([np.average(boxes[g], axis=0, weights=scores[g] + 1e-6) for g in kept]).reshape(-1, 4),
         labels[first],
-        -np.sort(-means[means >= least]),
+        -np.sort(-means[means >= min_score]),
         masks[first],
     )
 
 
-def _look(detector: TrainedDetector, image: NDArray[np.uint8], look: Look, least: float, most: int) -> Found:
-    scale, mirrored = look
+def _found_in(
+    detector: TrainedDetector,
+    image: NDArray[np.uint8],
+    augmentation: Augmentation,
+    min_score: float,
+    max_detections: int,
+) -> Found:
+    scale, mirrored = augmentation
     size = round(scale * detector.config.use_size[0]), round(scale * detector.config.use_size[1])
     if not mirrored:
-        return find(detector, image, least=least, most=most, size=size)
-    found = find(detector, np.ascontiguousarray(image[:, ::-1]), least=least, most=most, size=size)
+        return find(detector, image, min_score=min_score, max_detections=max_detections, size=size)
+    found = find(
+        detector, np.ascontiguousarray(image[:, ::-1]), min_score=min_score, max_detections=max_detections, size=size
+    )
     boxes = found.boxes.copy()
     boxes[:, [0, 2]] = image.shape[1] - boxes[:, [2, 0]]
     return replace(found, boxes=boxes, masks=found.masks[:, :, ::-1])
 
 
-def _mean_of_looks(scores: NDArray[np.float64], which: NDArray[np.int64], looks: int) -> float:
-    return sum(float(scores[which == look].max(initial=0.0)) for look in range(looks)) / looks
+def _mean_score(scores: NDArray[np.float64], which: NDArray[np.int64], augmentations: int) -> float:
+    return (
+        sum(float(scores[which == augmentation].max(initial=0.0)) for augmentation in range(augmentations))
+        / augmentations
+    )
 
 
 class MaskRCNN:
-    """A Detector that was trained for its classes; a model is found by its name. least: score of a detection. most: of
-    one class, 0 = all. It looks at the picture as often as `LOOKS` says for its backbone."""
+    """A Detector that was trained for its classes; a model is found by its name. min_score: of a detection.
+    max_detections: of one class, 0 = all. `AUGMENTATIONS` says how a picture is augmented for its backbone."""
 
-    def __init__(self, detector: TrainedDetector, least: float = 0.5, most: int = 0) -> None:
-        self.detector, self.least, self.most = detector, least, most
+    def __init__(self, detector: TrainedDetector, min_score: float = 0.5, max_detections: int = 0) -> None:
+        self.detector, self.min_score, self.max_detections = detector, min_score, max_detections
 
     def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
         """Instances of the models, by falling score; with no models, of all classes. Raises ConfigError where a model
@@ -306,8 +325,10 @@ class MaskRCNN:
                 f"this detector does not know {', '.join(unknown)}; it was trained for {', '.join(classes)}. Use "
                 "the detector 'novel' (--detector novel), or train one with posekit train detector."
             )
-        found = find_in_looks(self.detector, view.image, LOOKS[self.detector.config.backbone], least=self.least)
-        left = dict.fromkeys([m.name for m in models] or classes, self.most or len(found.labels))
+        found = find_augmented(
+            self.detector, view.image, AUGMENTATIONS[self.detector.config.backbone], min_score=self.min_score
+        )
+        left = dict.fromkeys([m.name for m in models] or classes, self.max_detections or len(found.labels))
         detections = []
         for box, label, score, mask in zip(found.boxes, found.labels, found.scores, found.masks, strict=True):
             name = classes[label]

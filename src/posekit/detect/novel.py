@@ -42,46 +42,45 @@ ANY = "novel"  # the name of the shipped detector
 SIDE = 96  # pixels of the pictures whose features are compared
 LEVELS = {"2": 16, "3": 32}  # of the features, and their strides
 MARGIN = 1.1
-WEIGHT, USUAL = 20.0, 0.56  # of an object's likeness, and the one that says nothing: docs/decisions/0015
+WEIGHT, USUAL = 20.0, 0.56  # of an object's similarity, and the one that says nothing: docs/decisions/0015
 
 
 @dataclass(frozen=True)
 class NovelOptions:
-    """scales: of the detector's ``use_size``, one look at the picture each. proposals: of a look at most.
-    least_proposal: their least score. same: intersection over union of boxes from which two looks propose the same.
-    screened: proposals that are compared with templates. least: the least score of a detection. most: detections of a
-    mesh. features: weight of the features against the templates. chroma: difference of the median a and b (CIELAB, 8
-    bits) at which a score falls to 1/e. objectness: power of the proposal's own score. views: pictures of a mesh whose
-    features are kept. overlap: intersection over union of masks from which two detections are of one instance.
-    """
+    """How `NovelDetector` looks for objects that no detector was trained for."""
 
-    scales: tuple[float, ...] = (2 / 3, 1.0, 4 / 3)
-    proposals: int = 80
-    same: float = 0.7
-    screened: int = 40
-    least_proposal: float = 0.1
-    least: float = 0.3
-    most: int = 3
-    features: float = 3.0
-    chroma: float = 60.0
-    objectness: float = 0.2
-    views: int = 66
-    overlap: float = 0.5
+    scales: tuple[float, ...] = (2 / 3, 1.0, 4 / 3)  # of the detector's ``use_size``, one look at the picture each
+    proposals: int = 80  # of a look at most
+    same: float = 0.7  # intersection over union of boxes from which two scales propose the same
+    screened: int = 40  # proposals that are compared with templates
+    min_proposal_score: float = 0.1  # their least score
+    min_score: float = 0.3  # the least score of a detection
+    max_detections: int = 3  # detections of a mesh
+    features: float = 3.0  # weight of the features against the templates
+    chroma: float = 60.0  # difference of the median a and b (CIELAB, 8 bits) at which a score falls to 1/e
+    objectness: float = 0.2  # power of the proposal's own score
+    views: int = 66  # pictures of a mesh whose features are kept
+    overlap: float = 0.5  # intersection over union of masks from which two detections are of one instance
 
     def __post_init__(self) -> None:
-        if min(len(self.scales), self.proposals, self.screened, self.most, self.views) < 1 or self.features < 0:
-            raise ConfigError("scales, proposals, screened, most and views are at least 1, features not negative.")
+        if (
+            min(len(self.scales), self.proposals, self.screened, self.max_detections, self.views) < 1
+            or self.features < 0
+        ):
+            raise ConfigError(
+                "scales, proposals, screened, max_detections and views are at least 1, features not negative."
+            )
 
 
 @dataclass(frozen=True, eq=False)
-class _Looks:
+class _Appearance:
     """Of pictures. features: (N, C), each level's of unit length. chroma: (N, 2)."""
 
     features: FArray
     chroma: FArray
 
 
-class Likeness:
+class AppearanceSimilarity:
     """How much detections look like a mesh. What it keeps of a mesh is made at its first use.
 
     Raises WeightsError where ImageNet's weights are missing.
@@ -91,15 +90,17 @@ class Likeness:
         self.renderer, self.options = renderer, options
         self._body = Lite0()
         load_lite0(self._body, lite0_imagenet())
-        self._known: WeakKeyDictionary[ObjectModel, tuple[TemplateSearch, _Looks]] = WeakKeyDictionary()
+        self._known: WeakKeyDictionary[ObjectModel, tuple[TemplateSearch, _Appearance]] = WeakKeyDictionary()
 
-    def of(self, view: View, model: ObjectModel, proposals: Sequence[Detection], looks: _Looks) -> list[float]:
+    def of(
+        self, view: View, model: ObjectModel, proposals: Sequence[Detection], appearance: _Appearance
+    ) -> list[float]:
         """Of each proposal, in [0, 1], in two rounds: what neither its features nor its chroma speaks for gets no
         template search, and 0."""
         search, known = self._of(model)
         options = self.options
-        alike = np.maximum(0.0, (looks.features @ known.features.T).max(axis=1) / len(LEVELS)).astype(np.float64)
-        apart = np.linalg.norm(known.chroma[None] - looks.chroma[:, None], axis=2).min(axis=1)
+        alike = np.maximum(0.0, (appearance.features @ known.features.T).max(axis=1) / len(LEVELS)).astype(np.float64)
+        apart = np.linalg.norm(known.chroma[None] - appearance.chroma[:, None], axis=2).min(axis=1)
         own = np.array([proposal.score for proposal in proposals])
         faded = np.exp(-apart / options.chroma) * own**options.objectness
         screen = alike * faded
@@ -110,25 +111,25 @@ class Likeness:
             scores[k] = min(1.0, (shape + options.features * alike[k]) / (1 + options.features)) * faded[k]
         return [float(score) for score in scores]
 
-    def _of(self, model: ObjectModel) -> tuple[TemplateSearch, _Looks]:
+    def _of(self, model: ObjectModel) -> tuple[TemplateSearch, _Appearance]:
         if model not in self._known:
             pictures = self._pictures(model)
             self._known[model] = (
                 TemplateSearch(model, self.renderer),
-                _Looks(self._features(pictures), _chroma(pictures)),
+                _Appearance(self._features(pictures), _chroma(pictures)),
             )
         return self._known[model]
 
-    def looks(self, view: View, proposals: Sequence[Detection]) -> _Looks:
+    def appearance(self, view: View, proposals: Sequence[Detection]) -> _Appearance:
         crops = [self._crop(view, proposal) for proposal in proposals]
-        return _Looks(self._features(crops), _chroma(crops))
+        return _Appearance(self._features(crops), _chroma(crops))
 
     def _pictures(self, model: ObjectModel) -> list[View]:
         distance = 4.0 * model.diameter
         focal = 0.9 * SIDE * distance / model.diameter
         camera = Camera(focal, focal, 0.5 * SIDE - 0.5, 0.5 * SIDE - 0.5, SIDE, SIDE)
         rotations = [view_rotation(d) for d in fibonacci_sphere(self.options.views)]
-        poses = [Pose(R, np.array([0, 0, distance])) @ model.T_obj_ctr.inverse() for R in rotations]
+        poses = [Pose(R, np.array([0, 0, distance])) @ model.T_ctr_obj for R in rotations]
         drawn = self.renderer.render(model, poses, camera, light=Light(), coords=False)
         return [view for view in drawn if view.mask is not None and view.mask.any()]
 
@@ -162,7 +163,7 @@ class NovelDetector:
                 "class-agnostic weights, or use it for its own classes."
             )
         self.detector, self.renderer, self.options = detector, renderer, options
-        self.likeness = Likeness(renderer, options)
+        self.similarity = AppearanceSimilarity(renderer, options)
         self._textured: dict[ObjectModel, FeatureSearch] = {}
 
     def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
@@ -174,8 +175,8 @@ class NovelDetector:
         known = [each for model in models for each in self._by_features(view, model)]
         if not proposals:
             return known
-        looks = self.likeness.looks(view, proposals)
-        found = [each for model in models for each in self._instances(view, model, proposals, looks)]
+        appearance = self.similarity.appearance(view, proposals)
+        found = [each for model in models for each in self._instances(view, model, proposals, appearance)]
         new = [each for each in found if not any(_same_instance(each, other, self.options.overlap) for other in known)]
         return known + [sharpened(view.image, each) for each in new]
 
@@ -184,10 +185,12 @@ class NovelDetector:
         if model not in self._textured:
             self._textured[model] = FeatureSearch(model, self.renderer)
         search = self._textured[model]
-        least, size = search.options.least, view.camera.size
+        matches, size = search.options.min_matches, view.camera.size
         return [
-            Detection(clipped(each.box, size), None, each.inliers / (each.inliers + least), model.name, Source.FEATURES)
-            for each in search.search(view)[: self.options.most]
+            Detection(
+                clipped(each.box, size), None, each.inliers / (each.inliers + matches), model.name, Source.FEATURES
+            )
+            for each in search.search(view)[: self.options.max_detections]
         ]
 
     def propose(self, view: View) -> list[Detection]:
@@ -195,11 +198,11 @@ class NovelDetector:
         options = self.options
         width, height = self.detector.config.use_size
         sizes = [(round(scale * width), round(scale * height)) for scale in options.scales]
-        looks = [find(self.detector, view.image, least=options.least_proposal, most=options.proposals, size=size)
-                 for size in sizes]  # fmt: skip
-        boxes = np.concatenate([look.boxes for look in looks])
-        scores = np.concatenate([look.scores for look in looks])
-        masks = np.concatenate([look.masks for look in looks])
+        least, most = options.min_proposal_score, options.proposals
+        found = [find(self.detector, view.image, min_score=least, max_detections=most, size=size) for size in sizes]
+        boxes = np.concatenate([each.boxes for each in found])
+        scores = np.concatenate([each.scores for each in found])
+        masks = np.concatenate([each.masks for each in found])
         kept = torchvision().ops.nms(torch.from_numpy(boxes), torch.from_numpy(scores), options.same).numpy()
         return [
             Detection((float(x0), float(y0), float(x1), float(y1)), mask, float(score), None, Source.NOVEL)
@@ -208,32 +211,35 @@ class NovelDetector:
 
     def similarities(self, view: View, model: ObjectModel, proposals: Sequence[Detection]) -> list[float]:
         """How much each proposal looks like the mesh, in [0, 1]."""
-        return self.likeness.of(view, model, proposals, self.likeness.looks(view, proposals)) if proposals else []
+        return (
+            self.similarity.of(view, model, proposals, self.similarity.appearance(view, proposals)) if proposals else []
+        )
 
     def _instances(
-        self, view: View, model: ObjectModel, proposals: Sequence[Detection], looks: _Looks
+        self, view: View, model: ObjectModel, proposals: Sequence[Detection], appearance: _Appearance
     ) -> list[Detection]:
-        scores = self.likeness.of(view, model, proposals, looks)
+        scores = self.similarity.of(view, model, proposals, appearance)
         kept: list[Detection] = []
         for k in np.argsort(np.negative(scores), kind="stable"):
             proposal, score = proposals[int(k)], scores[int(k)]
-            if score < self.options.least or len(kept) == self.options.most:
+            if score < self.options.min_score or len(kept) == self.options.max_detections:
                 break
             if all(_overlap(proposal, other) < self.options.overlap for other in kept):
                 kept.append(Detection(proposal.box, proposal.mask, score, model.name, Source.NOVEL))
         return kept
 
 
-class LikenedDetector:
+class SimilarityDetector:
     """A detector that was trained for its meshes, whose detections' scores also say how much they look like them: the
-    log odds grow by `WEIGHT` times what the likeness is above `USUAL`. Meshes without colours are left to the detector.
+    log odds grow by `WEIGHT` times what the similarity is above `USUAL`. Meshes without colours keep the detector's
+    scores.
 
-    least: score of a detection. most: of one mesh, 0 = all.
+    min_score: score of a detection. max_detections: of one mesh, 0 = all.
     """
 
-    def __init__(self, detector: MaskRCNN, renderer: Renderer, least: float, most: int = 0) -> None:
-        self.detector, self.least, self.most = detector, least, most
-        self.likeness = Likeness(renderer, NovelOptions(objectness=0.0))
+    def __init__(self, detector: MaskRCNN, renderer: Renderer, min_score: float, max_detections: int = 0) -> None:
+        self.detector, self.min_score, self.max_detections = detector, min_score, max_detections
+        self.similarity = AppearanceSimilarity(renderer, NovelOptions(objectness=0.0))
 
     def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
         """Instances of the models, by falling score; with no models, of all classes by the detector's own scores.
@@ -244,21 +250,21 @@ class LikenedDetector:
             if not mine or (model.colors is None and model.texture is None):
                 continue
             proposals = [found[k] for k in mine]
-            alike = self.likeness.of(view, model, proposals, self.likeness.looks(view, proposals))
-            for k, likeness in zip(mine, alike, strict=True):
-                found[k] = replace(found[k], score=likened(found[k].score, likeness))
+            alike = self.similarity.of(view, model, proposals, self.similarity.appearance(view, proposals))
+            for k, similarity in zip(mine, alike, strict=True):
+                found[k] = replace(found[k], score=with_similarity(found[k].score, similarity))
         left: dict[str | None, int] = {}
         kept = []
         for each in sorted(found, key=lambda d: -d.score):
-            left[each.label] = left.get(each.label, self.most or len(found)) - 1
-            if each.score >= self.least and left[each.label] >= 0:
+            left[each.label] = left.get(each.label, self.max_detections or len(found)) - 1
+            if each.score >= self.min_score and left[each.label] >= 0:
                 kept.append(each)
         return kept
 
 
-def likened(chance: float, likeness: float) -> float:
+def with_similarity(chance: float, similarity: float) -> float:
     """A chance that also says how much a thing looks like the mesh: docs/decisions/0015."""
-    return shifted(chance, WEIGHT * (likeness - USUAL))
+    return shifted(chance, WEIGHT * (similarity - USUAL))
 
 
 def shifted(chance: float, shift: float) -> float:
@@ -297,27 +303,32 @@ def make_detector(
     name: str | None,
     models: Sequence[ObjectModel],
     *,
-    least: float | None = None,
-    most: int = 3,
+    min_score: float | None = None,
+    max_detections: int = 3,
     doubtful: bool = False,
 ) -> tuple[Detector, tuple[str, ...]]:
     """A network's Detector and the names that its detections may have. name: "novel" (the default), "coco", or a
-    trained detector's file or folder. most: detections of a mesh. doubtful: whether poses will judge the detections, so
-    that trained detectors' doubtful ones are wanted too, and no more than ``most``. Raises WeightsError, ConfigError.
+    trained detector's file or folder. max_detections: of a mesh. doubtful: whether poses will judge the detections, so
+    that trained detectors' doubtful ones are wanted too, and no more than ``max_detections``. Raises WeightsError,
+    ConfigError.
     """
     file = SHIPPED if name is None or name == ANY else Path(name)
     trained = load_coco() if name == COCO else load_detector(file)
     if not trained.config.novel:
         names = tuple(m.name for m in models) or trained.config.classes
         usual = DOUBTFUL if doubtful else 0.5
-        least = usual if least is None else least
+        min_score = usual if min_score is None else min_score
         if name == COCO:
-            return MaskRCNN(trained, least, most if doubtful else 0), names
-        return LikenedDetector(
-            MaskRCNN(trained, min(least, DOUBTFUL)), Renderer(), least, most if doubtful else 0
+            return MaskRCNN(trained, min_score, max_detections if doubtful else 0), names
+        return SimilarityDetector(
+            MaskRCNN(trained, min(min_score, DOUBTFUL)), Renderer(), min_score, max_detections if doubtful else 0
         ), names
 
-    options = NovelOptions(most=most) if least is None else NovelOptions(least=least, least_proposal=least, most=most)
-    if models and least is not None:
-        options = NovelOptions(least=least, most=most)
+    options = (
+        NovelOptions(max_detections=max_detections)
+        if min_score is None
+        else NovelOptions(min_score=min_score, min_proposal_score=min_score, max_detections=max_detections)
+    )
+    if models and min_score is not None:
+        options = NovelOptions(min_score=min_score, max_detections=max_detections)
     return NovelDetector(trained, Renderer(), options), tuple(m.name for m in models) or trained.config.classes

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from posekit.align.mask_edge import fit_contour
+from posekit.align.mask_edge import fit_mask_edge
 from posekit.camera import Box, mask_box
 from posekit.errors import ConfigError
 from posekit.estimate.refine import Refinement, RefineOptions, compare, predicted_angle, refine, update_pose
 from posekit.first_pose.features import FeatureSearch
-from posekit.first_pose.hypotheses import BoxSearch, Hypothesis, Judge, agreement_of, poses_beside
+from posekit.first_pose.hypotheses import BoxSearch, EvidenceScorer, Hypothesis, agreement_of, perturbed_poses
 from posekit.first_pose.mvnet import FirstPoseSearch, mvnet_search
 from posekit.geometry import Pose, rotation_angle
 from posekit.mesh.model import ObjectModel
@@ -27,33 +27,29 @@ from posekit.view import View
 
 INITS = ("templates", "mvnet")
 AUTO = "auto"  # correspondences where the network gives them, else the regressed delta
-STRUCTURE, BLUR, ANGLE, BIAS = 5.7, -1.6, -1.6, 1.2  # of `presence`, fitted: docs/decisions/0020
-SMALLEST = 0.3  # degrees: smaller predicted errors say no more
-USUAL = 2.0  # pixels of the crop: the correspondences' expected error, where the network gives none
-FIRST, SEMIFINALISTS, HEATS, FINALISTS = 1, 4, 3, 2  # iterations after which only so many hypotheses go on
-DOUBT = 0.3  # evidence that outweighs a radian of predicted angle
+STRUCTURE, BLUR, ANGLE, BIAS = 5.7, -1.6, -1.6, 1.2  # of `existence_score`, fitted: docs/decisions/0020
+SMALLEST_ANGLE_DEG = 0.3  # degrees: smaller predicted errors say no more
+DEFAULT_SCALE_PX = 2.0  # pixels of the crop: the correspondences' expected error, where the network gives none
+FIRST, SEMIFINALISTS, PRUNING_ITERATIONS, FINALISTS = 1, 4, 3, 2  # iterations after which only so many hypotheses go on
+EVIDENCE_PER_RADIAN = 0.3  # evidence that outweighs a radian of predicted angle
 DIFFERENT = float(np.deg2rad(10.0))  # turn, or shift in diameters, from which an alternative is another pose
-BESIDE = float(np.deg2rad(12.0))  # how far from a known pose others are tried
+PERTURBED = float(np.deg2rad(12.0))  # how far from a known pose others are tried
 
 
 @dataclass(frozen=True)
 class EstimateOptions:
-    """init: where first poses come from. hypotheses: how many of them are refined, for each of a detection's masks.
-    update: what moves the pose, one of RefineOptions' or AUTO. beside: whether poses beside a known one are tried too
-    where it does not converge at once. contour: whether the pose is laid onto the mask's outline where the mask proves
-    exact. outline: whether refinement weighs the outline that the photograph's colours show. top: poses that an
-    estimate keeps, itself and alternatives. The rest is RefineOptions', with the angle in degrees."""
+    """What `PoseEstimator` does with a detection, or with a given pose."""
 
-    init: str = "templates"
-    hypotheses: int = 5
-    update: str = AUTO
-    stop: str = "angle"
-    iterations: int = 50
-    stop_angle_deg: float = 2.0
-    beside: bool = True
-    contour: bool = True
-    outline: bool = True
-    top: int = 1
+    init: str = "templates"  # where first poses come from: "templates" or "mvnet"
+    hypotheses: int = 5  # first poses that are refined, for each of a detection's masks
+    update: str = AUTO  # what moves the pose: one of RefineOptions', or AUTO
+    stop: str = "angle"  # as RefineOptions'
+    iterations: int = 50  # as RefineOptions'
+    stop_angle_deg: float = 2.0  # as RefineOptions', degrees
+    perturb: bool = True  # try poses turned by 12 degrees from a given one too, where that does not converge at once
+    mask_edge: bool = True  # fit the pose to the edge of a mask that proves exact
+    colour_edge: bool = True  # weigh the silhouette's edge that the photograph's colours show
+    top: int = 1  # poses that an estimate keeps: itself and alternatives
 
     def __post_init__(self) -> None:
         if self.init not in INITS:
@@ -68,7 +64,7 @@ class EstimateOptions:
         """dense: whether the network gives correspondences."""
         update = ("correspondence" if dense else "regression") if self.update == AUTO else self.update
         stop_angle = float(np.deg2rad(self.stop_angle_deg))
-        return RefineOptions(update, self.stop, self.iterations, stop_angle, outline=self.outline)
+        return RefineOptions(update, self.stop, self.iterations, stop_angle, colour_edge=self.colour_edge)
 
 
 class PoseEstimator:
@@ -104,7 +100,7 @@ class PoseEstimator:
     def weights_hash(self) -> str:
         return self.networks.digest
 
-    def estimate(self, view: View, detections: Sequence[Detection], least: float = 0.0) -> list[Estimate]:
+    def estimate(self, view: View, detections: Sequence[Detection], min_score: float = 0.0) -> list[Estimate]:
         """One estimate for each detection that gives a silhouette to start from, in their order. least: the score that
         is asked for; what has not half of it after a few iterations is not refined to the end."""
         estimates = []
@@ -115,60 +111,65 @@ class PoseEstimator:
             if not first:
                 continue
             masked = view.with_mask(detection.mask)
-            judge = Judge(masked, detection.box, self.model, self.renderer)
-            refined = self._refined(masked, judge, [h.T_cam_obj for h in first], 0.5 * least)
+            scorer = EvidenceScorer(masked, detection.box, self.model, self.renderer)
+            refined = self._refined(masked, scorer, [h.T_cam_obj for h in first], 0.5 * min_score)
             done = time.perf_counter()
             timings = {"first_pose": searched - started, "refine": done - searched, "total": done - started}
-            estimates.append(self._choose(masked, judge, refined, detection, timings))
+            estimates.append(self._choose(masked, scorer, refined, detection, timings))
         return estimates
 
     def refine(self, view: View, T_cam_obj: Pose) -> Estimate:
         """Refine a known pose; view.mask, where there is one, helps. Where it does not converge within a few
         iterations, the four poses turned by 12 degrees towards a tetrahedron's corners compete with it."""
         started = time.perf_counter()
-        options, judge = self.refine_options, self._judge_of(view, T_cam_obj)
-        if self.options.beside and options.stop == "angle" and options.iterations > HEATS:
-            heats = self._heats(view, [T_cam_obj])
-            if not heats[0].converged:
-                heats += self._heats(view, poses_beside(T_cam_obj, self.model, BESIDE))
-            refined = self._finals(view, judge, heats)
+        options, scorer = self.refine_options, self._scorer_of(view, T_cam_obj)
+        if self.options.perturb and options.stop == "angle" and options.iterations > PRUNING_ITERATIONS:
+            candidates = self._candidates(view, [T_cam_obj])
+            if not candidates[0].converged:
+                candidates += self._candidates(view, perturbed_poses(T_cam_obj, self.model, PERTURBED))
+            refined = self._finals(view, scorer, candidates)
         else:
             refined = refine(view, self.model, [T_cam_obj], self.predictor, self.renderer, options)
         seconds = time.perf_counter() - started
-        found = self._choose(view, judge, refined, None, {"refine": seconds, "total": seconds})
+        found = self._choose(view, scorer, refined, None, {"refine": seconds, "total": seconds})
         return nearest_to(T_cam_obj, found, self.model, Branch.GIVEN)
 
-    def _refined(self, view: View, judge: Judge, starts: Sequence[Pose], least: float) -> list[Refinement]:
+    def _refined(
+        self, view: View, scorer: EvidenceScorer, starts: Sequence[Pose], min_score: float
+    ) -> list[Refinement]:
         """Every start for a few iterations, and the best of them to the end, unless its score is below ``least``."""
         options = self.refine_options
-        if len(starts) <= FINALISTS or options.iterations <= HEATS:
+        if len(starts) <= FINALISTS or options.iterations <= PRUNING_ITERATIONS:
             return refine(view, self.model, starts, self.predictor, self.renderer, options)
-        heats = self._best(judge, self._heats(view, starts, FIRST), max(SEMIFINALISTS, self.options.top))
-        heats = self._onward(view, heats, HEATS - FIRST)
-        if least > 0 and self._last_look(view, self._best(judge, heats, 1)[0].T_cam_obj)[0] < least:
-            return heats
-        return self._finals(view, judge, heats)
+        candidates = self._best(scorer, self._candidates(view, starts, FIRST), max(SEMIFINALISTS, self.options.top))
+        candidates = self._continued(view, candidates, PRUNING_ITERATIONS - FIRST)
+        if min_score > 0 and self._assess(view, self._best(scorer, candidates, 1)[0].T_cam_obj)[0] < min_score:
+            return candidates
+        return self._finals(view, scorer, candidates)
 
-    def _heats(self, view: View, starts: Sequence[Pose], iterations: int = HEATS) -> list[Refinement]:
+    def _candidates(self, view: View, starts: Sequence[Pose], iterations: int = PRUNING_ITERATIONS) -> list[Refinement]:
         short = replace(self.refine_options, iterations=iterations)
         return refine(view, self.model, starts, self.predictor, self.renderer, short)
 
-    def _finals(self, view: View, judge: Judge, heats: Sequence[Refinement]) -> list[Refinement]:
+    def _finals(self, view: View, scorer: EvidenceScorer, candidates: Sequence[Refinement]) -> list[Refinement]:
         """The best go on to the end."""
-        finalists = self._best(judge, heats, max(FINALISTS, self.options.top))
-        return self._onward(view, finalists, self.refine_options.iterations - HEATS)
+        finalists = self._best(scorer, candidates, max(FINALISTS, self.options.top))
+        return self._continued(view, finalists, self.refine_options.iterations - PRUNING_ITERATIONS)
 
-    def _best(self, judge: Judge, heats: Sequence[Refinement], count: int) -> list[Refinement]:
-        order = np.argsort([-s for s in self._scores(judge, heats)], kind="stable")
-        return [heats[k] for k in order[:count]]
+    def _best(self, scorer: EvidenceScorer, candidates: Sequence[Refinement], count: int) -> list[Refinement]:
+        order = np.argsort([-s for s in self._scores(scorer, candidates)], kind="stable")
+        return [candidates[k] for k in order[:count]]
 
-    def _onward(self, view: View, heats: Sequence[Refinement], iterations: int) -> list[Refinement]:
+    def _continued(self, view: View, candidates: Sequence[Refinement], iterations: int) -> list[Refinement]:
         """So many more; with the paper's policy only for what has not converged."""
         options = replace(self.refine_options, iterations=iterations)
-        there = [heat.converged and options.stop == "angle" for heat in heats]
-        poses = [heat.T_cam_obj for heat, done in zip(heats, there, strict=True) if not done]
+        there = [candidate.converged and options.stop == "angle" for candidate in candidates]
+        poses = [candidate.T_cam_obj for candidate, done in zip(candidates, there, strict=True) if not done]
         ends = iter(refine(view, self.model, poses, self.predictor, self.renderer, options))
-        return [heat if done else heat.then(next(ends), options.stop) for heat, done in zip(heats, there, strict=True)]
+        return [
+            candidate if done else candidate.then(next(ends), options.stop)
+            for candidate, done in zip(candidates, there, strict=True)
+        ]
 
     def first_poses(self, view: View, detection: Detection) -> list[Hypothesis]:
         """The first poses that ``options.init`` gives, best first; those for a detection's rough mask come last. Those
@@ -188,14 +189,14 @@ class PoseEstimator:
     def _choose(
         self,
         view: View,
-        judge: Judge,
+        scorer: EvidenceScorer,
         refined: Sequence[Refinement],
         detection: Detection | None,
         timings: dict[str, float],
     ) -> Estimate:
         """The hypothesis with the best score: much evidence in the photograph, and a low predicted angle. The next best
         ones that differ from it and from each other are its alternatives."""
-        first, *others = self._best(judge, refined, len(refined) if self.options.top > 1 else 1)
+        first, *others = self._best(scorer, refined, len(refined) if self.options.top > 1 else 1)
         kept = [self._estimate_of(view, first, detection, timings)]
         for other in others:
             if len(kept) < self.options.top and all(self._differ(other.T_cam_obj, k.T_cam_obj) for k in kept):
@@ -210,16 +211,16 @@ class PoseEstimator:
     def _estimate_of(
         self, view: View, refined: Refinement, detection: Detection | None, timings: dict[str, float]
     ) -> Estimate:
-        best, contour_std = self._on_contour(view, refined)
-        presence, angle = self._last_look(view, best.T_cam_obj)
+        best, mask_edge_std = self._on_mask_edge(view, refined)
+        existence, angle = self._assess(view, best.T_cam_obj)
         return Estimate(
             T_cam_obj=best.T_cam_obj,
             angle=angle,
-            contour_std=contour_std,
+            mask_edge_std=mask_edge_std,
             iterations=best.iterations,
-            converged=(angle if contour_std is None else contour_std) < self.refine_options.stop_angle,
+            converged=(angle if mask_edge_std is None else mask_edge_std) < self.refine_options.stop_angle,
             branch=Branch.ANY if self.model.symmetries else None,
-            score=presence,
+            score=existence,
             box=self._box(view, best.T_cam_obj),
             model=self.model.name,
             detection=detection,
@@ -227,40 +228,40 @@ class PoseEstimator:
             timings=timings,
         )
 
-    def _on_contour(self, view: View, refined: Refinement) -> tuple[Refinement, float | None]:
+    def _on_mask_edge(self, view: View, refined: Refinement) -> tuple[Refinement, float | None]:
         """With its outline on the mask's, where there is an exact one, and the fit's standard deviation; else as it is,
         and None."""
-        if self.options.contour and view.mask is not None:
-            fit = fit_contour(view, self.model, refined.T_cam_obj, self.renderer)
+        if self.options.mask_edge and view.mask is not None:
+            fit = fit_mask_edge(view, self.model, refined.T_cam_obj, self.renderer)
             if fit is not None and fit.exact:
                 return replace(refined, T_cam_obj=fit.T_cam_obj), fit.turn_std
         return refined, None
 
-    def _last_look(self, view: View, T_cam_obj: Pose) -> tuple[float, float]:
+    def _assess(self, view: View, T_cam_obj: Pose) -> tuple[float, float]:
         """How sure it is that the photograph shows the object there, by what the network sees of it; and the rotation
         error that the network predicts there, radians."""
-        outline = self.model.outline - self.model.center
+        outline = self.model.hull_ctr
         [prediction], [observed], [rendered] = compare(
             view, self.model, outline, [T_cam_obj], self.predictor, self.renderer
         )
         found = prediction.correspondences
-        error = float(np.median(found.scale_px)) if found is not None and len(found.scale_px) else USUAL
+        error = float(np.median(found.scale_px)) if found is not None and len(found.scale_px) else DEFAULT_SCALE_PX
         update = self.refine_options.update
-        outlined = self.refine_options.outline
+        outlined = self.refine_options.colour_edge
         updated = update_pose(T_cam_obj, self.model, prediction, observed, rendered, update, outlined)
         angle = predicted_angle(T_cam_obj, prediction, updated, update)
-        return presence(agreement_of(observed, rendered).structure, error, angle), angle
+        return existence_score(agreement_of(observed, rendered).structure, error, angle), angle
 
-    def _scores(self, judge: Judge, refined: Sequence[Refinement]) -> list[float]:
-        evidence = judge.scores([r.T_cam_obj for r in refined])
-        return [score(r.angle, each) for r, each in zip(refined, evidence, strict=True)]
+    def _scores(self, scorer: EvidenceScorer, refined: Sequence[Refinement]) -> list[float]:
+        evidence = scorer.scores([r.T_cam_obj for r in refined])
+        return [hypothesis_score(r.angle, each) for r, each in zip(refined, evidence, strict=True)]
 
-    def _judge_of(self, view: View, T_cam_obj: Pose) -> Judge:
+    def _scorer_of(self, view: View, T_cam_obj: Pose) -> EvidenceScorer:
         """Of a known pose's surroundings."""
-        return Judge(view, self._box(view, T_cam_obj), self.model, self.renderer)
+        return EvidenceScorer(view, self._box(view, T_cam_obj), self.model, self.renderer)
 
     def _box(self, view: View, T_cam_obj: Pose) -> Box:
-        points = T_cam_obj.apply(self.model.outline)
+        points = T_cam_obj.apply(self.model.hull_vertices)
         points[:, 2] = np.maximum(points[:, 2], 1e-3)
         return view.camera.points_box(points)
 
@@ -295,16 +296,16 @@ def nearest_to(reference: Pose, estimate: Estimate, model: ObjectModel, branch: 
     return replace(estimate, T_cam_obj=model.symmetries.nearest(estimate.T_cam_obj, reference), branch=branch)
 
 
-def score(angle: float, evidence: float) -> float:
+def hypothesis_score(angle: float, evidence: float) -> float:
     """What hypotheses are chosen by, of a predicted angle (radians) and the evidence: docs/decisions/0018."""
-    return evidence - DOUBT * angle
+    return evidence - EVIDENCE_PER_RADIAN * angle
 
 
-def presence(structure: float, error_px: float, angle: float) -> float:
+def existence_score(structure: float, error_px: float, angle: float) -> float:
     """Between 0 and 1: how likely it is that the object is there in this pose. structure: `Agreement`'s, how alike the
     brightness gradients of picture and drawing are. error_px: median of the errors that the network expects of its
     correspondences, pixels of the crop. angle: predicted rotation error, radians. A logistic function fitted to
     estimates of objects, shown and not shown, in composed scenes: docs/decisions/0020."""
-    degrees = max(float(np.rad2deg(angle)), SMALLEST)
+    degrees = max(float(np.rad2deg(angle)), SMALLEST_ANGLE_DEG)
     total = STRUCTURE * structure + BLUR * np.log(error_px) + ANGLE * np.log(degrees) + BIAS
     return float(1 / (1 + np.exp(-total)))

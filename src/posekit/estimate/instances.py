@@ -21,7 +21,7 @@ from posekit.view import View
 class Estimator(Protocol):
     """What a `PoseEstimator` does for the search."""
 
-    def estimate(self, view: View, detections: Sequence[Detection], least: float = 0.0) -> list[Estimate]: ...
+    def estimate(self, view: View, detections: Sequence[Detection], min_score: float = 0.0) -> list[Estimate]: ...
 
 
 EstimatorOf = Callable[[ObjectModel], Estimator]
@@ -29,16 +29,15 @@ EstimatorOf = Callable[[ObjectModel], Estimator]
 
 @dataclass(frozen=True)
 class SearchOptions:
-    """instances: kept at most; 0 = all. least: score of an estimate below which it is no instance. overlap: of the
-    boxes (intersection over union) from which two estimates are of one instance."""
+    """Which of the estimates of a picture are instances."""
 
-    instances: int = 1
-    least: float = 0.5
-    overlap: float = 0.5
+    instances: int = 1  # kept at most; 0 = all
+    min_score: float = 0.5  # score of an estimate below which it is no instance
+    overlap: float = 0.5  # of the boxes (intersection over union) from which two estimates are of one instance
 
     def __post_init__(self) -> None:
-        if self.instances < 0 or not 0 <= self.least <= 1 or not 0 < self.overlap <= 1:
-            raise ConfigError("instances is not negative, least in [0, 1] and overlap in (0, 1].")
+        if self.instances < 0 or not 0 <= self.min_score <= 1 or not 0 < self.overlap <= 1:
+            raise ConfigError("instances is not negative, min_score in [0, 1] and overlap in (0, 1].")
 
     @classmethod
     def usual(cls, detections: Sequence[Detection]) -> SearchOptions:
@@ -87,12 +86,12 @@ def estimates_of(
     estimator: Estimator, view: View, detections: Sequence[Detection], options: SearchOptions
 ) -> list[Estimate]:
     """An estimate for each detection that leads to one, in their order. What the novel detector found is scored by
-    how much it looks like the mesh as well: a logistic function's argument grows by `WEIGHT` times what the likeness
+    how much it looks like the mesh as well: a logistic function's argument grows by `WEIGHT` times what the similarity
     is above `USUAL` (docs/decisions/0015)."""
     found = []
     for detection in detections:
         shift = WEIGHT * (detection.score - USUAL) if detection.source is Source.NOVEL else 0.0
-        for estimate in estimator.estimate(view, [detection], shifted(options.least, -shift)):
+        for estimate in estimator.estimate(view, [detection], shifted(options.min_score, -shift)):
             others = tuple(replace(e, score=shifted(e.score, shift)) for e in estimate.alternatives)
             found.append(replace(estimate, score=shifted(estimate.score, shift), alternatives=others))
     return found
@@ -102,7 +101,7 @@ def instances_of(estimates: Sequence[Estimate], options: SearchOptions) -> list[
     """Those of an object's estimates that are instances of it, best first."""
     kept: list[Estimate] = []
     for each in sorted(estimates, key=lambda e: -e.score):
-        if each.score >= options.least and all(box_overlap(each.box, k.box) < options.overlap for k in kept):
+        if each.score >= options.min_score and all(box_overlap(each.box, k.box) < options.overlap for k in kept):
             kept.append(each)
     return kept[: options.instances] if options.instances else kept
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from posekit.align.colour_edge import learn, outline_lines
-from posekit.align.fusion import Points, fuse
+from posekit.align.gauss_newton import Points, fuse
 from posekit.align.pnp import solve_pnp
 from posekit.errors import ConfigError
 from posekit.geometry import Pose, rotation_angle
@@ -33,25 +33,22 @@ STOPS = ("angle", "fixed")
 RESTING = float(np.deg2rad(0.25))  # of turns, and as a share of the distance: a pose that moves less is at rest
 NEAR = float(np.deg2rad(12.0))  # corrections below which the outline is looked for: further off it is out of reach
 LEAST_SCALE, KNEE = 0.5, 2.5  # pixels, no correspondence is more exact; standard deviations
-TOGETHER = 25.0  # so many correspondences err alike: they count as one against the outline's lines
+CORRELATED = 25.0  # so many correspondences err alike: they count as one against the outline's lines
 
 
 @dataclass(frozen=True)
 class RefineOptions:
-    """update: what moves the pose, the regressed delta or the correspondences through PnP.
-    stop: ``angle`` (the paper's policy) or ``fixed`` (DeepIM's). iterations: at most, or exactly.
-    stop_angle: radians. last_update: also apply the update predicted for the pose that ended the loop. patience: with
-    ``angle``, how many iterations may pass without a new lowest predicted angle. outline: whether the place of the
-    outline that the photograph's colours show is weighed against the correspondences, once these ask for small turns
-    only (see `with_outline`)."""
+    """The refinement loop."""
 
-    update: str = "correspondence"
-    stop: str = "angle"
-    iterations: int = 50
-    stop_angle: float = float(np.deg2rad(2.0))
-    last_update: bool = True
-    patience: int = 8
-    outline: bool = True
+    update: str = "correspondence"  # what moves the pose, the regressed delta or the correspondences through PnP
+    stop: str = "angle"  # ``angle`` (the paper's policy) or ``fixed`` (DeepIM's)
+    iterations: int = 50  # at most, or exactly
+    stop_angle: float = float(np.deg2rad(2.0))  # radians
+    last_update: bool = True  # also apply the update predicted for the pose that ended the loop
+    patience: int = 8  # with ``angle``, how many iterations may pass without a new lowest predicted angle
+    # whether the place of the outline that the photograph's colours show is weighed against the correspondences, once
+    # these ask for small turns only (see `with_colour_edge`)
+    colour_edge: bool = True
 
     def __post_init__(self) -> None:
         if self.update not in UPDATES or self.stop not in STOPS:
@@ -98,16 +95,16 @@ def refine(
     """
     if options.update == "correspondence" and not predictor.dense:
         raise ConfigError("this preset predicts no correspondences: the update is regression (--update regression).")
-    outline = model.outline - model.center
+    hull = model.hull_ctr
     loops = [_Loop(start) for start in starts]
     for _ in range(options.iterations):
         active = [loop for loop in loops if not loop.done]
         if not active:
             break
         poses = [loop.pose for loop in active]
-        predictions, observed, rendered = compare(view, model, outline, poses, predictor, renderer)
+        predictions, observed, rendered = compare(view, model, hull, poses, predictor, renderer)
         for loop, prediction, seen, drawn in zip(active, predictions, observed, rendered, strict=True):
-            updated = update_pose(loop.pose, model, prediction, seen, drawn, options.update, options.outline)
+            updated = update_pose(loop.pose, model, prediction, seen, drawn, options.update, options.colour_edge)
             loop.advance(predicted_angle(loop.pose, prediction, updated, options.update), updated, options)
     return [loop.finish(options) for loop in loops]
 
@@ -115,27 +112,27 @@ def refine(
 def compare(
     view: View,
     model: ObjectModel,
-    outline: NDArray[np.float64],
+    hull: NDArray[np.float64],
     poses: Sequence[Pose],
     predictor: Predictor,
     renderer: Renderer,
 ) -> tuple[list[PairPrediction], list[View], list[View]]:
     """Zoom to each pose, draw the object there, and let the predictor compare. poses: ``T_cam_obj``."""
-    observed, rendered = crops(view, model, outline, poses, predictor.size, renderer, coords=predictor.dense)
+    observed, rendered = crops(view, model, hull, poses, predictor.size, renderer, coords=predictor.dense)
     return predictor.predict(observed, rendered), observed, rendered
 
 
 def crops(
     view: View,
     model: ObjectModel,
-    outline: NDArray[np.float64],
+    hull: NDArray[np.float64],
     poses: Sequence[Pose],
     size: tuple[int, int],
     renderer: Renderer,
     coords: bool = True,
 ) -> tuple[list[View], list[View]]:
     """The photograph zoomed to each ``T_cam_obj``, and the object drawn there. size: (width, height)."""
-    zooms = [zoom_to_pose(view.camera, T @ model.T_obj_ctr, outline, size) for T in poses]
+    zooms = [zoom_to_pose(view.camera, T @ model.T_obj_ctr, hull, size) for T in poses]
     observed = [view.zoomed(zoom) for zoom in zooms]
     turned = [Pose.rotation(zoom.R_view_cam) @ T for zoom, T in zip(zooms, poses, strict=True)]
     return observed, renderer.render(model, turned, [z.camera for z in zooms], coords=coords)
@@ -148,11 +145,11 @@ def update_pose(
     observed: View,
     rendered: View,
     update: str,
-    outline: bool = False,
+    colour_edge: bool = False,
 ) -> Pose | None:
     """The pose after one prediction; None where it gives none (too few correspondences, behind the camera).
 
-    outline: whether small corrections by correspondences are weighed against the outline, see `with_outline`.
+    colour_edge: whether small corrections by correspondences are weighed against the outline, see `with_colour_edge`.
     """
     T_view_cam = Pose.rotation(observed.R_view_cam)
     source = T_view_cam @ T_cam_obj @ model.T_obj_ctr
@@ -163,16 +160,16 @@ def update_pose(
         assert found is not None and rendered.coords is not None
         points = rendered.coords[found.source[:, 1], found.source[:, 0]] - model.center
         target = solve_pnp(points, found.target, found.weight, found.scale_px, rendered.camera, source)
-        if outline and target is not None and prediction.silhouettes is not None:
+        if colour_edge and target is not None and prediction.silhouettes is not None:
             turn = max(prediction.angle, float(rotation_angle(target.R @ source.R.T)))
             if turn < NEAR:
-                target = with_outline(target, points, found, prediction, observed, rendered, model.center)
+                target = with_colour_edge(target, points, found, prediction, observed, rendered, model.center)
     if target is None or not np.isfinite(target.matrix).all() or target.t[2] < 0.6 * model.diameter:
         return None
-    return T_view_cam.inverse() @ target @ model.T_obj_ctr.inverse()
+    return T_view_cam.inverse() @ target @ model.T_ctr_obj
 
 
-def with_outline(
+def with_colour_edge(
     target: Pose,
     points: NDArray[np.float64],
     found: Correspondences,
@@ -198,7 +195,7 @@ def with_outline(
     if lines is None:
         return target
     scale = np.maximum(found.scale_px, LEAST_SCALE)
-    matched = Points(points, found.target, found.weight, scale, KNEE, TOGETHER)
+    matched = Points(points, found.target, found.weight, scale, KNEE, CORRELATED)
     both = fuse(target, [matched, lines], rendered.camera)
     return target if both is None else both.pose
 

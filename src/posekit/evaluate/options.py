@@ -20,33 +20,27 @@ NOT_RESULTS = ("workers",)  # what may differ between two runs of the same resul
 
 @dataclass(frozen=True)
 class EvalOptions:
-    """dataset: a known name, or None. root: its folder. units: of BOP's
-    meshes, auto or one of object_model.UNITS. objects: numbers, all where empty. images: (scene, image),
-    all where empty. limit: that many pictures, spread evenly. min_visible: instances at least as visible, in [0, 1];
-    None is the test's own targets. detections: one of GIVEN, DETECTOR or a JSON file. detector: which one, a name or
-    file of weights, as `novel.make_detector` takes it. masks: whether the refiner is given the visible mask. noise:
-    degrees and three cm, standard deviations; seed: of the disturbances. threads: of torch, in each worker; the same
-    whatever the number of workers, since sums depend on it. device: of the networks. The rest is EstimateOptions'."""
+    """What an evaluation measures, and on what."""
 
     stage: str
-    dataset: str | None = None
-    root: Path | None = None
+    dataset: str | None = None  # a known name, or None
+    root: Path | None = None  # its folder
     split: str | None = None
-    units: str = "auto"
-    objects: tuple[int, ...] = ()
-    images: tuple[tuple[int, int], ...] = ()
-    limit: int | None = None
-    min_visible: float | None = None
-    detections: str = "gt-masks"
-    detector: str = "novel"
-    masks: str = "true"
-    noise: tuple[float, float, float, float] = (15.0, 1.0, 1.0, 5.0)
-    seed: int = 0
+    units: str = "auto"  # of BOP's meshes, auto or one of object_model.UNITS
+    objects: tuple[int, ...] = ()  # numbers, all where empty
+    images: tuple[tuple[int, int], ...] = ()  # (scene, image), all where empty
+    limit: int | None = None  # that many pictures, spread evenly
+    min_visible: float | None = None  # instances at least as visible, in [0, 1]; None is the test's own targets
+    detections: str = "gt-masks"  # one of GIVEN, DETECTOR or a JSON file
+    detector: str = "novel"  # which one, a name or file of weights, as `novel.make_detector` takes it
+    masks: str = "true"  # whether the refiner is given the visible mask
+    noise: tuple[float, float, float, float] = (15.0, 1.0, 1.0, 5.0)  # degrees and three cm, standard deviations;
+    seed: int = 0  # of the disturbances
     preset: str = "lite"
     weights: Path | None = None
     estimate: EstimateOptions = EstimateOptions()
-    threads: int = 1
-    device: str = "auto"
+    threads: int = 1  # of torch, in each worker; the same whatever the number of workers, since sums depend on it
+    device: str = "auto"  # of the networks. The rest is EstimateOptions'.
     workers: int = 1
 
     def __post_init__(self) -> None:

@@ -231,7 +231,7 @@ def _case(scored: Scored, k: int, data: Dataset, renderer: Renderer) -> str:
 def tile(case: Case, guess: Guess | None, data: Dataset, renderer: Renderer) -> draw.Image:
     """The photograph round the object twice, side by side: with the outline of the truth, and of the estimate."""
     view, model = data.view(case.scene, case.image), data.model(case.obj_id)
-    zoom = zoom_to_pose(view.camera, case.T_cam_obj @ model.T_obj_ctr, model.outline - model.center, _TILE, enlarge=1.8)
+    zoom = zoom_to_pose(view.camera, case.T_cam_obj @ model.T_obj_ctr, model.hull_ctr, _TILE, enlarge=1.8)
     picture = view.zoomed(zoom).image
     turn = Pose.rotation(zoom.R_view_cam)
     truth = outlined(renderer, picture, zoom.camera, model, turn @ case.T_cam_obj, draw.ORANGE)

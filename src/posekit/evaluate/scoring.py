@@ -170,7 +170,7 @@ def _score_object(group: _Group, measured: MeasuredModel, info: DatasetInfo, vsd
     scale = np.array([640.0 / c.width for c in group.cases])
     g, c = group.pairs.T
     vertices = model.vertices.astype(np.float64)
-    surface = metrics.mssd(est[g], gt[c], model.outline, symmetries) / measured.diameter
+    surface = metrics.mssd(est[g], gt[c], model.hull_vertices, symmetries) / measured.diameter
     pixels = metrics.mspd(est[g], gt[c], K[c], vertices, symmetries) * scale[c]
     found = _assigned(group, surface)
     errors = _errors(group, est, gt, K, found, measured, info, symmetries, vertices)

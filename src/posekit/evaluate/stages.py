@@ -172,7 +172,7 @@ def disturbed(truth: Truth, estimator: PoseEstimator, options: EvalOptions) -> P
     """The truth disturbed about the object's centre, by random numbers of this instance alone."""
     i, model = truth.instance, estimator.model
     rng = np.random.default_rng([options.seed, i.scene, i.image, i.index])
-    return options.pose_noise.disturb(i.T_cam_obj @ model.T_obj_ctr, rng) @ model.T_obj_ctr.inverse()
+    return options.pose_noise.disturb(i.T_cam_obj @ model.T_obj_ctr, rng) @ model.T_ctr_obj
 
 
 def detections_for(data: Any, options: EvalOptions) -> Regions:

@@ -51,7 +51,7 @@ class VsdMeter:
 def window(camera: Camera, model: ObjectModel, poses: list[Pose]) -> tuple[int, int, int, int]:
     """(x0, y0, width, height) in the picture that holds the object at all poses; the whole picture where a pose is
     not wholly in front of the camera."""
-    points = np.concatenate([pose.apply(model.outline) for pose in poses])
+    points = np.concatenate([pose.apply(model.hull_vertices) for pose in poses])
     if points[:, 2].min() < 0.01:
         return 0, 0, camera.width, camera.height
     box: Box = camera.points_box(points)

@@ -47,24 +47,21 @@ ALIKE = 0.8  # cosine of two descriptors of one thing, where its place is known
 
 @dataclass(frozen=True)
 class FeatureOptions:
-    """ratio: of the descriptors' distances to the best and to the second best place of the mesh, at most. apart: of two
-    such places, in diameters. error: of a match, a share of the picture's longer side (or of the box's, where there is
-    one), and error_px, pixels at least. size: factor between a keypoint's size and the one that the pose gives it.
-    turn: radians, likewise. least: matches at different places that bear a pose out. share: of all matches with the
-    mesh's picture area. spread: of the projected mesh's area, within these matches. instances: at most. seed: of the
-    robust fit."""
+    """How local features are matched, and what a pose from them needs."""
 
-    ratio: float = 0.85
-    apart: float = 0.1
+    ratio: float = 0.85  # of the descriptors' distances to the best and to the second best place of the mesh, at most
+    apart: float = 0.1  # of two such places, in diameters
+    # of a match, a share of the picture's longer side (or of the box's, where there is one), and error_px, pixels at
+    # least
     error: float = 0.004
     error_px: float = 2.0
-    size: float = 1.6
-    turn: float = float(np.deg2rad(35.0))
-    least: int = 8
-    share: float = 0.3
-    spread: float = 0.05
-    instances: int = 5
-    seed: int = 0
+    size: float = 1.6  # factor between a keypoint's size and the one that the pose gives it
+    turn: float = float(np.deg2rad(35.0))  # radians, likewise
+    min_matches: int = 8  # matches at different places that bear a pose out
+    share: float = 0.3  # of all matches with the mesh's picture area
+    spread: float = 0.05  # of the projected mesh's area, within these matches
+    instances: int = 5  # at most
+    seed: int = 0  # of the robust fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +135,7 @@ class FeatureSearch:
         if known.plain:
             return []
         seen = keypoints_of(view, box)
-        if len(seen.pixels) < self.options.least:
+        if len(seen.pixels) < self.options.min_matches:
             return []
         alike = seen.descriptors @ known.descriptors.T
         found: list[FeaturePose] = []
@@ -178,7 +175,7 @@ class FeatureSearch:
     ) -> FeaturePose | None:
         """The instance that most matches agree on; None where too few do."""
         options, known = self.options, self.features
-        if len(rows) < options.least:
+        if len(rows) < options.min_matches:
             return None
         points, pixels = known.points[columns], seen.pixels[rows]
         pose = _robust_pose(points, pixels, camera, error, options.seed)
@@ -186,11 +183,11 @@ class FeatureSearch:
             if pose is None:
                 return None
             borne = self._borne_out(camera, seen, rows, columns, pose, error)
-            if borne.sum() < options.least:
+            if borne.sum() < options.min_matches:
                 return None
             ones = np.ones(int(borne.sum()))
             pose = solve_pnp(
-                points[borne], pixels[borne], ones, ones, camera, pose, PnpConfig(min_points=options.least)
+                points[borne], pixels[borne], ones, ones, camera, pose, PnpConfig(min_points=options.min_matches)
             )
         if pose is None or pose.t[2] < 0.5 * self.model.diameter:
             return None
@@ -241,15 +238,15 @@ class FeatureSearch:
         better = solve_pnp(points, pixels, np.ones(len(rows)), size / size.min(), camera, T_cam_ctr)
         if better is None:
             return one
-        T_cam_obj = better @ self.model.T_obj_ctr.inverse()
-        box = camera.points_box(T_cam_obj.apply(self.model.outline))
+        T_cam_obj = better @ self.model.T_ctr_obj
+        box = camera.points_box(T_cam_obj.apply(self.model.hull_vertices))
         return replace(one, T_cam_obj=T_cam_obj, points=points + self.model.center, pixels=pixels, box=box)
 
     def _judged(
         self, camera: Camera, T_cam_ctr: Pose, points: Array, pixels: Array, borne: NDArray[np.bool_], error: float
     ) -> FeaturePose | None:
         """As the result where enough matches, spread over the mesh, bear it out."""
-        T_cam_obj = T_cam_ctr @ self.model.T_obj_ctr.inverse()
+        T_cam_obj = T_cam_ctr @ self.model.T_ctr_obj
         hull = self._hull(camera, T_cam_obj)
         if hull is None or not borne.any():
             return None
@@ -259,15 +256,15 @@ class FeatureSearch:
         area = float(cv2.contourArea(cv2.convexHull(pixels[chosen].astype(np.float32)))) if len(chosen) > 2 else 0.0
         spread = area / max(1.0, float(cv2.contourArea(hull)))
         options = self.options
-        if len(chosen) < options.least or share < options.share or spread < options.spread:
+        if len(chosen) < options.min_matches or share < options.share or spread < options.spread:
             return None
-        outline = T_cam_obj.apply(self.model.outline)
+        outline = T_cam_obj.apply(self.model.hull_vertices)
         places = points[borne] + self.model.center
         return FeaturePose(T_cam_obj, len(chosen), share, places, pixels[borne], camera.points_box(outline))
 
     def _hull(self, camera: Camera, T_cam_obj: Pose) -> FArray | None:
         """The projected mesh's convex hull (N, 1, 2); None where it reaches behind the camera."""
-        corners = T_cam_obj.apply(self.model.outline)
+        corners = T_cam_obj.apply(self.model.hull_vertices)
         if corners[:, 2].min() < 1e-3:
             return None
         return np.asarray(cv2.convexHull(camera.project(corners).astype(np.float32)), np.float32)

@@ -47,14 +47,13 @@ FLAT = 20.0  # a gradient below which brightness says little, in Sobel's units o
 
 @dataclass(frozen=True)
 class TemplateOptions:
-    """views: directions over the sphere. turns: in-plane rotations. size: side of the compared patches in pixels.
-    colour: weight of the colour agreement against the silhouettes'. apart: least angle between two hypotheses."""
+    """How `TemplateSearch` works."""
 
-    views: int = 200
-    turns: int = 24
-    size: int = 32
-    colour: float = 0.5
-    apart: float = float(np.deg2rad(20.0))
+    views: int = 200  # directions over the sphere
+    turns: int = 24  # in-plane rotations
+    size: int = 32  # side of the compared patches in pixels
+    colour: float = 0.5  # weight of the colour agreement against the silhouettes'
+    apart: float = float(np.deg2rad(20.0))  # least angle between two hypotheses
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +114,7 @@ class TemplateSearch:
         self.distance = 4.0 * model.diameter
         focal = 0.9 * side * self.distance / model.diameter
         self.camera = Camera(focal, focal, 0.5 * side - 0.5, 0.5 * side - 0.5, side, side)
-        T_ctr_obj = model.T_obj_ctr.inverse()
+        T_ctr_obj = model.T_ctr_obj
         poses = [Pose(R, np.array([0, 0, self.distance])) @ T_ctr_obj for R in self.rotations]
         views = renderer.render(model, poses, self.camera, light=Light(), coords=False)
         found = [_patch(v.image, _u8(v.mask), options.size) for v in views]
@@ -176,24 +175,21 @@ class TemplateSearch:
         T_view_ctr = Pose(R, crop.camera.backproject(pixel, depth))
         ray_turn = rotation_between([0.0, 0.0, 1.0], T_view_ctr.t)
         T_view_ctr = Pose(ray_turn @ T_view_ctr.R, T_view_ctr.t)  # seen along this ray it looks as the template does
-        return Pose.rotation(crop.R_view_cam.T) @ T_view_ctr @ self.model.T_obj_ctr.inverse()
+        return Pose.rotation(crop.R_view_cam.T) @ T_view_ctr @ self.model.T_ctr_obj
 
 
 @dataclass(frozen=True)
 class BoxOptions:
-    """views: directions over the sphere. turns: in-plane rotations, a multiple of 4. side: of the compared pictures,
-    pixels; root: square root of the box's area in them. aspect: factor by which a silhouette's aspect may differ from
-    the box's. tried: silhouettes that are moved. apart: least angle between two hypotheses. weights: of the evidence.
-    """
+    """How `BoxSearch` works."""
 
-    views: int = 200
-    turns: int = 24
-    side: int = 48
-    root: float = 26.0
-    aspect: float = 1.42
-    tried: int = 64
-    apart: float = float(np.deg2rad(20.0))
-    weights: Weights = Weights()
+    views: int = 200  # directions over the sphere
+    turns: int = 24  # in-plane rotations, a multiple of 4
+    side: int = 48  # of the compared pictures, pixels;
+    root: float = 26.0  # square root of the box's area in them
+    aspect: float = 1.42  # factor by which a silhouette's aspect may differ from the box's
+    tried: int = 64  # silhouettes that are moved
+    apart: float = float(np.deg2rad(20.0))  # least angle between two hypotheses
+    weights: Weights = Weights()  # of the evidence
 
 
 @dataclass(frozen=True)
@@ -254,7 +250,7 @@ class BoxSearch:
         self.distance = 4.0 * model.diameter
         focal = 0.9 * TEMPLATE * self.distance / model.diameter
         self.camera = Camera(focal, focal, 0.5 * TEMPLATE - 0.5, 0.5 * TEMPLATE - 0.5, TEMPLATE, TEMPLATE)
-        poses = [Pose(R, np.array([0, 0, self.distance])) @ model.T_obj_ctr.inverse() for R in self.rotations]
+        poses = [Pose(R, np.array([0, 0, self.distance])) @ model.T_ctr_obj for R in self.rotations]
         views = renderer.render(model, poses, self.camera, light=Light(), coords=False)
         turns = np.arange(options.turns // 4) * (2 * np.pi / options.turns)
         found = [self._place(k, view, turn) for k, view in enumerate(views) for turn in turns]
@@ -360,10 +356,10 @@ class BoxSearch:
         R = so3_exp([0.0, 0.0, placed.turn + move.turn]) @ self.rotations[placed.view]
         t = camera.backproject(pixel, depth)
         T_view_ctr = Pose(rotation_between([0.0, 0.0, 1.0], t) @ R, t)  # along this ray it looks as the template does
-        return Pose.rotation(crop.R_view_cam.T) @ T_view_ctr @ self.model.T_obj_ctr.inverse()
+        return Pose.rotation(crop.R_view_cam.T) @ T_view_ctr @ self.model.T_ctr_obj
 
 
-class Judge:
+class EvidenceScorer:
     """Evidence for rendered poses in one window of a photograph, so that poses can be compared with each other."""
 
     def __init__(self, view: View, box: Box, model: ObjectModel, renderer: Renderer, weights: Weights = Weights()):
@@ -401,7 +397,7 @@ class MVNetSearch:
         self.model, self.size, self.mvnet = model, networks.size, networks.mvnet
         self.rotations = cube_views()
         self.camera, self.distance = frontal_camera(model, networks.size)
-        poses = [Pose(R, np.array([0, 0, self.distance])) @ model.T_obj_ctr.inverse() for R in self.rotations]
+        poses = [Pose(R, np.array([0, 0, self.distance])) @ model.T_ctr_obj for R in self.rotations]
         views = renderer.render(model, poses, self.camera, coords=False)
         self.device = networks.device
         self.views = torch.from_numpy(np.stack([to_input(v.image, v.mask) for v in views])).to(self.device)
@@ -419,7 +415,7 @@ class MVNetSearch:
         if not np.isfinite(target.matrix).all() or target.t[2] < 0.6 * self.model.diameter:
             return []
         T_cam_view = Pose.rotation(crop.R_view_cam.T)
-        return [Hypothesis(T_cam_view @ target @ self.model.T_obj_ctr.inverse(), 1.0)][:count]
+        return [Hypothesis(T_cam_view @ target @ self.model.T_ctr_obj, 1.0)][:count]
 
     def frontal(self, crop_camera: Camera) -> Pose:
         """The ``T_view_ctr`` to which MV-Net's answer is relative."""
@@ -433,12 +429,12 @@ def _is_apart(pose: Pose, found: Sequence[Hypothesis], model: ObjectModel, angle
     return bool((model.symmetries.angles(pose.R, np.stack([h.T_cam_obj.R for h in found])) > angle).all())
 
 
-def poses_beside(T_cam_obj: Pose, model: ObjectModel, angle: float) -> list[Pose]:
+def perturbed_poses(T_cam_obj: Pose, model: ObjectModel, angle: float) -> list[Pose]:
     """The pose turned by ``angle`` (radians) about the object's centre, towards each corner of a tetrahedron."""
     T_cam_ctr = T_cam_obj @ model.T_obj_ctr
     corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3)
     turned = [Pose(so3_exp(angle * corner) @ T_cam_ctr.R, T_cam_ctr.t) for corner in corners]
-    return [T @ model.T_obj_ctr.inverse() for T in turned]
+    return [T @ model.T_ctr_obj for T in turned]
 
 
 @dataclass(frozen=True)

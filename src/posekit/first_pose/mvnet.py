@@ -30,19 +30,16 @@ FArray = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class MatchingOptions:
-    """enlarge: the crop's size in boxes, as in training. likely: least probability of a correspondence; present: that
-    a cell of the crop is in a view at all. error_px: how far off an inlier may be, in pixels of the crop. inliers:
-    fewest that make a pose. pooled: best views whose correspondences are also solved together. apart: least angle
-    between two hypotheses. refine: the last solve."""
+    """How MV-Net's answers become poses."""
 
-    enlarge: float = 1.35
-    likely: float = 0.08
-    present: float = 0.4
-    error_px: float = 6.0
-    inliers: int = 8
-    pooled: int = 3
-    apart: float = float(np.deg2rad(15.0))
-    refine: PnpConfig = PnpConfig(iterations=8, min_points=6)
+    enlarge: float = 1.35  # the crop's size in boxes, as in training
+    likely: float = 0.08  # least probability of a correspondence;
+    present: float = 0.4  # that a cell of the crop is in a view at all
+    error_px: float = 6.0  # how far off an inlier may be, in pixels of the crop
+    inliers: int = 8  # fewest that make a pose
+    pooled: int = 3  # best views whose correspondences are also solved together
+    apart: float = float(np.deg2rad(15.0))  # least angle between two hypotheses
+    refine: PnpConfig = PnpConfig(iterations=8, min_points=6)  # the last solve
 
 
 class FirstPoseSearch(Protocol):
@@ -56,11 +53,11 @@ class FirstPoseSearch(Protocol):
 @dataclass(frozen=True, eq=False)
 class Examined:
     """What MV-Net says of a detection. hypotheses: best first. mask: bool (H, W), the visible object in the photograph.
-    presence: probability that the box shows the mesh."""
+    existence_score: probability that the box shows the mesh."""
 
     hypotheses: list[Hypothesis]
     mask: NDArray[np.bool_]
-    presence: float
+    existence_score: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +130,7 @@ class MatchingSearch:
             if len(found) == count:
                 break
         back = Pose.rotation(zoom.R_view_cam.T)
-        placed = [Hypothesis(back @ h.T_cam_obj @ self.model.T_obj_ctr.inverse(), h.score) for h in found]
+        placed = [Hypothesis(back @ h.T_cam_obj @ self.model.T_ctr_obj, h.score) for h in found]
         presence = 1.0 / (1.0 + float(np.exp(-np.clip(answer.presence, -30, 30))))
         return Examined(placed, photo_mask(answer.silhouettes[0], zoom), presence)
 

@@ -48,11 +48,11 @@ class ViewBank:
         rotations = np.stack(
             [view_rotation(d) for d in (fibonacci_sphere(VIEWS) if directions is None else directions)]
         )
-        outline = (model.outline - model.center) / model.diameter
+        outline = (model.hull_ctr) / model.diameter
         inside = np.stack([_fitted(R, outline) for R in rotations])
         cameras = [Camera(f, f, cx, cy, VIEW, VIEW) for f, cx, cy in inside]
         place = np.array([0.0, 0.0, DISTANCE * model.diameter])
-        poses = [Pose(R, place) @ model.T_obj_ctr.inverse() for R in rotations]
+        poses = [Pose(R, place) @ model.T_ctr_obj for R in rotations]
         drawn = renderer.render(model if look is None else look, poses, cameras, light=HEADLIGHT)
         masks = np.stack([np.asarray(v.mask) for v in drawn])
         coords = (np.stack([np.asarray(v.coords) for v in drawn]) - model.center) / model.diameter

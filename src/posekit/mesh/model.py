@@ -19,8 +19,8 @@ from posekit.mesh.processing import (
     carried_uvs,
     checked_mesh,
     coincident,
+    convex_hull,
     face_areas,
-    hull_vertices,
     mean_colors,
     repaired_normals,
     smooth_normals,
@@ -159,21 +159,32 @@ class ObjectModel:
         return np.asarray(self.bounds[1] - self.bounds[0])
 
     @cached_property
-    def outline(self) -> Floats:
+    def hull_vertices(self) -> Floats:
         """(N, 3), the corners of the convex hull in ``obj``: all that decides which box the object fills."""
-        return hull_vertices(self.vertices.astype(np.float64))
+        return convex_hull(self.vertices.astype(np.float64))
 
     @cached_property
     def diameter(self) -> float:
         """The largest distance of two vertices; within 0.1 % of it where the hull has thousands of corners."""
-        points = self.outline
+        points = self.hull_vertices
         if len(points) > 4000:
             points = points[np.unique((points @ fibonacci_sphere(4000).T).argmax(axis=0))]
         return float(pdist(points).max())
 
     @cached_property
+    def hull_ctr(self) -> Floats:
+        """(N, 3), `hull_vertices` in ``ctr``."""
+        return self.hull_vertices - self.center
+
+    @cached_property
     def T_obj_ctr(self) -> Pose:
+        """From ``ctr`` (the mesh's axes, the origin at `center`) to ``obj``."""
         return Pose.translation(self.center)
+
+    @cached_property
+    def T_ctr_obj(self) -> Pose:
+        """From ``obj`` to ``ctr``."""
+        return self.T_obj_ctr.inverse()
 
     def simplified(self, faces: int) -> ObjectModel:
         """The same object with about so many faces, to be drawn small and often; itself where it has no more.

@@ -116,7 +116,7 @@ def carried_uvs(
     return np.concatenate(source), index.reshape(-1, 3), np.concatenate(means)
 
 
-def hull_vertices(points: Floats) -> Floats:
+def convex_hull(points: Floats) -> Floats:
     """The corners (N, 3) of the convex hull of points (V, 3), flat ones too."""
     middle = points.mean(axis=0)
     _, spread, axes = np.linalg.svd((points - middle).T @ (points - middle))

@@ -29,16 +29,14 @@ PAIR = 11  # channels that the tower over both crops sees: two RGB pictures, mas
 
 @dataclass(frozen=True)
 class LiteConfig:
-    """size: (width, height) of the crop in pixels, multiples of 8. widths: channels at 1/4 and 1/8. heads: of the
-    attention across. blocks: exchanges. bottleneck: channels of their 3x3 convolutions. fine: channels of the dense
-    head."""
+    """The size of the lite network."""
 
-    size: tuple[int, int] = (128, 96)
-    widths: tuple[int, int] = (64, 192)
-    heads: int = 1
-    blocks: int = 6
-    bottleneck: int = 96
-    fine: int = 48
+    size: tuple[int, int] = (128, 96)  # (width, height) of the crop in pixels, multiples of 8
+    widths: tuple[int, int] = (64, 192)  # channels at 1/4 and 1/8
+    heads: int = 1  # of the attention across
+    blocks: int = 6  # exchanges
+    bottleneck: int = 96  # channels of their 3x3 convolutions
+    fine: int = 48  # channels of the dense head
 
     @property
     def cells(self) -> tuple[int, int]:
@@ -180,7 +178,7 @@ def attention(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
         return torch.softmax((q * q.shape[-1] ** -0.5) @ k.transpose(2, 3), dim=3) @ v
 
 
-def likeness_of(rendered: Tensor, observed: Tensor) -> Tensor:
+def similarity_of(rendered: Tensor, observed: Tensor) -> Tensor:
     """Cosines of all pairs of cells: two (B, C, h, w) -> (B, h * w, h * w), rendered first."""
     a, b = F.normalize(rendered.flatten(2), dim=1), F.normalize(observed.flatten(2), dim=1)
     return torch.einsum("bcn,bcm->bnm", a, b).float()
@@ -190,14 +188,14 @@ def likeness_of(rendered: Tensor, observed: Tensor) -> Tensor:
 class LiteOutput:
     """All that the lite losses look at. flows: (B, 2, h, w) in pixels on cells, coarse to fine.
     rigid: (B, 2, h, w) in pixels on anchors, what the motions solved from the coarse and the fine flow induce.
-    compressed_angle: (B,). likenesses: (B, h * w, h * w + 1), logits of which observed cell each rendered one is, the
+    compressed_angle: (B,). similarities: (B, h * w, h * w + 1), logits of which observed cell each rendered one is, the
     last of them none, before and after the exchange."""
 
     prediction: Prediction
     flows: list[Tensor]
     rigid: list[Tensor]
     compressed_angle: Tensor
-    likenesses: list[Tensor]
+    similarities: list[Tensor]
 
 
 class LiteSVNet(nn.Module):
@@ -249,12 +247,12 @@ class LiteSVNet(nn.Module):
         cells = x[B:]
         matched = self.match(x).float()
         none = self.none(cells).float().flatten(2).transpose(1, 2)  # (B, h * w, 1)
-        likenesses = [
-            with_none(self.sharpness[0] * likeness_of(first[B:].float(), first[:B].float()),
+        similarities = [
+            with_none(self.sharpness[0] * similarity_of(first[B:].float(), first[:B].float()),
                       self.early_none.expand_as(none)),
-            with_none(self.sharpness[1] * likeness_of(matched[B:], matched[:B]), none),
+            with_none(self.sharpness[1] * similarity_of(matched[B:], matched[:B]), none),
         ]  # fmt: skip
-        flow, found = soft_flow(likenesses[-1], self.config.cells)
+        flow, found = soft_flow(similarities[-1], self.config.cells)
         known = torch.cat([flow / CELL, found], dim=1).to(cells.dtype)
         coarse = self.coarse(torch.cat([cells, known], dim=1))[:, :3].float()
         better = flow + CELL * coarse[:, :2]
@@ -279,7 +277,7 @@ class LiteSVNet(nn.Module):
             quat, v, expand_angle(angle), fine_flow, log_scale, dense[:, 3], dense[:, 4], silhouettes,
             self.score(summary).float()[:, 0],
         )  # fmt: skip
-        return LiteOutput(prediction, [flow, better], rigid, angle, likenesses)
+        return LiteOutput(prediction, [flow, better], rigid, angle, similarities)
 
     def _rigid(self, relief: Tensor, on: Tensor, focal: Tensor, flow: Tensor, log_weight: Tensor) -> Tensor:
         """The flow (B, 2, H/4, W/4) that the motion explaining the cells' flow induces on the anchors."""
@@ -306,18 +304,18 @@ def points_of(flow: Tensor) -> Tensor:
     return flow.flatten(2).transpose(1, 2)
 
 
-def with_none(likeness: Tensor, none: Tensor) -> Tensor:
+def with_none(similarity: Tensor, none: Tensor) -> Tensor:
     """(B, n, m) and (B, n, 1) -> (B, n, m + 1): the last choice is that the cell is not shown."""
-    return torch.cat([likeness, none.to(likeness.dtype)], dim=2)
+    return torch.cat([similarity, none.to(similarity.dtype)], dim=2)
 
 
-def soft_flow(likeness: Tensor, cells: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """The mean place that the softmax over each rendered cell's likenesses (B, h * w, h * w + 1) gives, as flow
+def soft_flow(similarity: Tensor, cells: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """The mean place that the softmax over each rendered cell's similarities (B, h * w, h * w + 1) gives, as flow
     (B, 2, h, w) in pixels; and (B, 2, h, w), the largest share of one place and the share of none."""
-    home = _grid(*cells, likeness)
-    share = torch.softmax(likeness[:, :, :-1], dim=2)
+    home = _grid(*cells, similarity)
+    share = torch.softmax(similarity[:, :, :-1], dim=2)
     place = torch.einsum("bnm,cm->bcn", share, home[0].flatten(1))
-    none = torch.sigmoid(likeness[:, :, -1] - torch.logsumexp(likeness[:, :, :-1], dim=2))
+    none = torch.sigmoid(similarity[:, :, -1] - torch.logsumexp(similarity[:, :, :-1], dim=2))
     found = torch.stack([share.amax(2), none], dim=1).unflatten(2, cells)
     return (place.unflatten(2, cells) - home) * CELL, found
 

@@ -38,12 +38,10 @@ def svnet_loss(prediction: Prediction, heads: PoseHeads, quat_wxyz: Tensor, v: T
 
 @dataclass(frozen=True)
 class DenseLossConfig:
-    """Weights of the lite preset's losses. hidden: weight of anchors that the observed picture does not show. mvnet: of
-    MV-Net's loss beside all others. near: of the crop's width, the mean distance in it from the rendered to the true
-    place at which a pose's score should be 1/e."""
+    """Weights of the lite preset's losses."""
 
     gamma: float = 0.8
-    hidden: float = 0.3
+    hidden: float = 0.3  # weight of anchors that the observed picture does not show
     flow: float = 0.25
     match: float = 1.0
     early: float = 0.3
@@ -55,8 +53,10 @@ class DenseLossConfig:
     angle: float = 1.0
     silhouettes: float = 1.0
     score: float = 1.0
+    # of the crop's width, the mean distance in it from the rendered to the true place at which a pose's score should
+    # be 1/e
     near: float = 0.03
-    mvnet: float = 1.0
+    mvnet: float = 1.0  # of MV-Net's loss beside all others
     max_flow_px: float = 80.0
     knee_px: float = 8.0
 
@@ -94,8 +94,8 @@ def dense_loss(
 
     shown = F.avg_pool2d((near & target.visible)[:, None].float(), 2)[:, 0] > 0.5
     judged_cells = F.avg_pool2d((target.valid & ~target.lost[:, None, None])[:, None].float(), 2)[:, 0] > 0.5
-    match = matching_loss(output.likenesses[-1], flow_cells, shown, judged_cells)
-    early = matching_loss(output.likenesses[0], flow_cells, shown, judged_cells)
+    match = matching_loss(output.similarities[-1], flow_cells, shown, judged_cells)
+    early = matching_loss(output.similarities[0], flow_cells, shown, judged_cells)
 
     total = weight.sum().clamp_min(1.0)
     error = (prediction.flow - target.flow).abs().sum(1)
@@ -157,11 +157,11 @@ def rigid_loss(flow: Tensor, truth: Tensor, judged: Tensor, knee: float) -> Tens
     return (knee * torch.log1p(error / knee) * judged).sum() / judged.sum().clamp_min(1.0)
 
 
-def matching_loss(likeness: Tensor, flow: Tensor, shown: Tensor, judged: Tensor) -> Tensor:
+def matching_loss(similarity: Tensor, flow: Tensor, shown: Tensor, judged: Tensor) -> Tensor:
     """Cross-entropy of the cell that each rendered cell lies on in the observed crop, or of none.
 
-    likeness: (B, h * w, h * w + 1), logits. flow: (B, 2, h, w), the truth in pixels. shown, judged: (B, h, w) bool; of
-    the judged cells those that are not shown, or lie beside the crop, are none. A place between cells counts for its
+    similarity: (B, h * w, h * w + 1), logits. flow: (B, 2, h, w), the truth in pixels. shown, judged: (B, h, w) bool;
+    of the judged cells those that are not shown, or lie beside the crop, are none. A place between cells counts for its
     four neighbours, bilinearly; without this loss the features learn to match several times more slowly (docs/log.md).
     """
     B, _, h, w = flow.shape
@@ -172,7 +172,7 @@ def matching_loss(likeness: Tensor, flow: Tensor, shown: Tensor, judged: Tensor)
     x0, y0 = x.floor(), y.floor()
     fx, fy = x - x0, y - y0
     first = (y0 * w + x0).long()
-    logits = torch.log_softmax(likeness, dim=2).view(B, h, w, h * w + 1)
+    logits = torch.log_softmax(similarity, dim=2).view(B, h, w, h * w + 1)
     total = -(logits[..., -1] * (judged & ~inside)).sum()
     for dy, dx, share in ((0, 0, (1 - fx) * (1 - fy)), (0, 1, fx * (1 - fy)), (1, 0, (1 - fx) * fy), (1, 1, fx * fy)):
         found = logits.gather(3, (first + dy * w + dx).unsqueeze(3)).squeeze(3)

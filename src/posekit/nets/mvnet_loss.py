@@ -14,20 +14,19 @@ from posekit.nets.mvnet import NONE, MVOutput
 
 @dataclass(frozen=True)
 class MVLossConfig:
-    """Weights of the parts. none: of the cells that are in no view, beside ``match``. early: of matches by codes alone.
-    reach: cosine of the largest angle between two directions of view for which the turn is asked."""
+    """Weights of the parts."""
 
     selection: float = 0.5
     match: float = 1.0
-    none: float = 0.5
-    early: float = 0.3
+    none: float = 0.5  # of the cells that are in no view, beside ``match``
+    early: float = 0.3  # of matches by codes alone
     offset: float = 1.0
     silhouette: float = 2.0
     dice: float = 0.5
     score: float = 0.5
     turn: float = 1.0
     presence: float = 0.5
-    reach: float = 0.5
+    reach: float = 0.5  # cosine of the largest angle between two directions of view for which the turn is asked
 
 
 def mvnet_loss(

@@ -29,11 +29,11 @@ SHIPPED = Path(__file__).resolve().parent.parent / "weights"
 
 @dataclass(frozen=True)
 class PaperConfig:
-    """size: (width, height) of the crop; width: share of FlowNetS's channels; views: MV-Net's."""
+    """The size of the paper's networks."""
 
-    size: tuple[int, int] = (640, 480)
-    width: float = 1.0
-    views: int = 6
+    size: tuple[int, int] = (640, 480)  # (width, height) of the crop;
+    width: float = 1.0  # share of FlowNetS's channels;
+    views: int = 6  # MV-Net's
 
 
 @dataclass(frozen=True, eq=False)

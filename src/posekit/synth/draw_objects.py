@@ -76,7 +76,7 @@ def draw_objects(
 
 def _layer(renderer: Renderer, placed: Placed, camera: Camera, light: Light) -> _Layer:
     """Its whole silhouette, outside the picture too, where the largest tile can hold it."""
-    points = placed.T_cam_obj.apply(placed.model.outline)
+    points = placed.T_cam_obj.apply(placed.model.hull_vertices)
     left = top = 0
     tile = camera
     if points[:, 2].min() > 1e-3:

@@ -115,7 +115,7 @@ def drop(models: Sequence[ObjectModel], rng: Rng, spread: float) -> list[Pose]:
 
 def _body(pybullet: Any, world: int, model: ObjectModel, rng: Rng, spread: float, height: float) -> int:
     """An object in the air; its body's frame is ``ctr``."""
-    hull = (model.outline - model.center).tolist()
+    hull = (model.hull_ctr).tolist()
     shape = pybullet.createCollisionShape(pybullet.GEOM_MESH, vertices=hull, physicsClientId=world)
     x, y, z, w = np.roll(Pose.rotation(random_rotation(rng)).quat_wxyz, -1)
     place = [*(rng.uniform(-1, 1, size=2) * spread), height]
@@ -128,8 +128,8 @@ def _body(pybullet: Any, world: int, model: ObjectModel, rng: Rng, spread: float
 def _rest(pybullet: Any, world: int, body: int, model: ObjectModel) -> Pose:
     place, (x, y, z, w) = pybullet.getBasePositionAndOrientation(body, physicsClientId=world)
     R = np.array(pybullet.getMatrixFromQuaternion([x, y, z, w])).reshape(3, 3)
-    pose = Pose.from_matrix(np.column_stack([R, place])) @ model.T_obj_ctr.inverse()
-    sunk = float(pose.apply(model.outline)[:, 2].min())
+    pose = Pose.from_matrix(np.column_stack([R, place])) @ model.T_ctr_obj
+    sunk = float(pose.apply(model.hull_vertices)[:, 2].min())
     return Pose(pose.R, pose.t - [0.0, 0.0, min(sunk, 0.0)])  # solvers let bodies sink in by a fraction of a mm
 
 

@@ -20,23 +20,22 @@ CONFIG = "synth.json"
 
 @dataclass(frozen=True)
 class SynthConfig:
-    """images: in all. size: (width, height). quality: of JPEG, percent; 0 = PNG. frames: in a sequence. views: of a
-    photoreal room. samples: light paths for each pixel. variant: Mitsuba's, "auto" = the fastest one here.
-    backgrounds, hdri: folders; empty = procedural ones. motion: of sequences, "mixed" = each of `MOTIONS` in turn."""
+    """A synthetic data set."""
 
     kind: str
-    images: int
+    images: int  # in all
     seed: int = 0
     split: str = "train"
-    size: tuple[int, int] = (640, 480)
-    quality: int = 95
+    size: tuple[int, int] = (640, 480)  # (width, height)
+    quality: int = 95  # of JPEG, percent; 0 = PNG
+    # backgrounds, hdri: folders; empty = procedural ones
     backgrounds: str = ""
     hdri: str = ""
-    frames: int = 100
-    views: int = 4
-    samples: int = 32
-    variant: str = "auto"
-    motion: str = MIXED
+    frames: int = 100  # in a sequence
+    views: int = 4  # of a photoreal room
+    samples: int = 32  # light paths for each pixel
+    variant: str = "auto"  # Mitsuba's, "auto" = the fastest one here
+    motion: str = MIXED  # of sequences, "mixed" = each of `MOTIONS` in turn
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:

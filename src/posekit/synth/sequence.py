@@ -154,7 +154,7 @@ def _moments(take: Take, seconds: float) -> int:
     ends = [seconds - SHUTTER / 2, seconds + SHUTTER / 2]
     longest = 0.0
     for thing in take.things:
-        few = thing.model.outline[:: max(1, len(thing.model.outline) // 64)]
+        few = thing.model.hull_vertices[:: max(1, len(thing.model.hull_vertices) // 64)]
         points = [(take.T_cam_world(s) @ thing.T_world_obj(s)).apply(few) for s in ends]
         if min(p[:, 2].min() for p in points) > 1e-3:
             way = take.camera.project(points[1]) - take.camera.project(points[0])

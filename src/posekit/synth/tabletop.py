@@ -35,29 +35,22 @@ TRIES = 20  # places tried for an object on the table
 
 @dataclass(frozen=True)
 class TabletopConfig:
-    """Lengths in units of the objects' median diameter.
+    """Lengths in units of the objects' median diameter."""
 
-    size: (width, height). fov_deg: of the longer side. objects, distractors: least and most in a scene. pile: share of
-    scenes with objects at random in a heap instead of at rest. table: share with a table; the others float before the
-    backdrop. photo: share of backdrops that are photographs, where there are any. distance: from the camera to the
-    scene's middle. elevation_deg: of the camera over the table. spread: radius in which objects lie. shadow: share of
-    tables with shadows. paint: how far the objects' paint strays from the meshes', 0 = not at all. scraps: least and
-    most parts cut out of photographs that lie about behind the objects.
-    """
-
-    size: tuple[int, int] = (640, 480)
-    fov_deg: tuple[float, float] = (35.0, 70.0)
+    size: tuple[int, int] = (640, 480)  # (width, height)
+    fov_deg: tuple[float, float] = (35.0, 70.0)  # of the longer side
+    # objects, distractors: least and most in a scene
     objects: tuple[int, int] = (1, 8)
     distractors: tuple[int, int] = (0, 6)
-    pile: float = 0.3
-    table: float = 0.7
-    photo: float = 0.7
-    distance: tuple[float, float] = (3.0, 9.0)
-    elevation_deg: tuple[float, float] = (10.0, 85.0)
-    spread: tuple[float, float] = (1.0, 3.0)
-    shadow: float = 0.7
-    paint: float = 1.0
-    scraps: tuple[int, int] = (0, 0)
+    pile: float = 0.3  # share of scenes with objects at random in a heap instead of at rest
+    table: float = 0.7  # share with a table; the others float before the backdrop
+    photo: float = 0.7  # share of backdrops that are photographs, where there are any
+    distance: tuple[float, float] = (3.0, 9.0)  # from the camera to the scene's middle
+    elevation_deg: tuple[float, float] = (10.0, 85.0)  # of the camera over the table
+    spread: tuple[float, float] = (1.0, 3.0)  # radius in which objects lie
+    shadow: float = 0.7  # share of tables with shadows
+    paint: float = 1.0  # how far the objects' paint strays from the meshes', 0 = not at all
+    scraps: tuple[int, int] = (0, 0)  # least and most parts cut out of photographs that lie about behind the objects
 
     def __post_init__(self) -> None:
         if not 0 <= self.objects[0] <= self.objects[1] or not 0 <= self.distractors[0] <= self.distractors[1]:
@@ -181,7 +174,7 @@ def _arranged(models: Sequence[ObjectModel], unit: float, pile: bool, config: Ta
     taken: list[tuple[Array, float]] = []
     for model in models:
         R = random_rotation(rng) if pile else resting_rotation(model, rng)
-        points = (model.outline - model.center) @ R.T
+        points = (model.hull_ctr) @ R.T
         reach = 0.8 * float(np.linalg.norm(points[:, :2], axis=1).max())
         place = _free_place(taken, reach, radius * (0.6 if pile else 1.0), 0 if pile else TRIES, rng)
         taken.append((place, reach))
@@ -211,7 +204,7 @@ def resting_rotation(model: ObjectModel, rng: Rng) -> Array:
 
     Facets are chosen by their area; the turn about the vertical is random.
     """
-    points = model.outline - model.center
+    points = model.hull_ctr
     normals, areas = _stable_facets(points)
     down = normals[int(rng.choice(len(areas), p=areas / areas.sum()))] if len(areas) else rng.normal(size=3)
     spin = so3_exp([0.0, 0.0, float(rng.uniform(0, 2 * np.pi))])
@@ -268,7 +261,7 @@ class _Canvas:
     def add(self, renderer: Renderer, model: ObjectModel, T_cam_obj: Pose, light: Light, paint: float, rng: Rng) -> int:
         """Draw an object; returns the pixels of its whole silhouette, 0 where it is not in the picture at all, too
         near or too large to draw."""
-        points = T_cam_obj.apply(model.outline)
+        points = T_cam_obj.apply(model.hull_vertices)
         if points[:, 2].min() < 0.2 * model.diameter:
             return 0
         x0, y0, x1, y1 = self.camera.points_box(points)
@@ -389,7 +382,7 @@ def _draw_shadows(
         return
     shadow = np.zeros(canvas.labels.shape, np.uint8)
     for model, T_world_obj in zip(models, T_world_objs, strict=True):
-        points = T_world_obj.apply(model.outline)
+        points = T_world_obj.apply(model.hull_vertices)
         fallen = T_cam_world.apply(points - points[:, 2:] / towards[2] * towards)
         if fallen[:, 2].min() > 0.2 * model.diameter:
             pixels = canvas.camera.project(fallen).clip(-4000, 4000).astype(np.int32)

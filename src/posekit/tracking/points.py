@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from posekit.align.colour_edge import Outline, find_outline
-from posekit.align.fusion import Points
+from posekit.align.gauss_newton import Points
 from posekit.camera import Zoom
 from posekit.geometry import Pose
 from posekit.mesh.model import ObjectModel
@@ -25,15 +25,15 @@ WINDOW, LEVELS = (13, 13), 3
 CORNERS, QUALITY, APART = 200, 0.005, 3  # at most; of the best one; pixels between two
 AGAIN = 0.7  # pixels from where it started that a point followed forwards and backwards may end
 LEAST = 6  # points
-SIGMA, TOGETHER = 0.5, 3.0  # pixels, expected error of a followed point; so many err alike
+SIGMA, CORRELATED = 0.5, 3.0  # pixels, expected error of a followed point; so many err alike
 # the same where the mesh's drawing is matched with the frame; and how far off a match may be, pixels
-TEXTURE_QUALITY, TEXTURE_SIGMA, TEXTURE_TOGETHER, FARTHEST = 0.02, 1.0, 0.7, 5.0
+TEXTURE_QUALITY, TEXTURE_SIGMA, TEXTURE_CORRELATED, FARTHEST = 0.02, 1.0, 0.7, 5.0
 ALIKE = (0.5, 0.8)  # correlations of patches from which on a match counts, and counts wholly
 PATCH, ROUND, FAINT = 9, 4.0, 4.0  # pixels; pixels; grey values below which contrast is noise
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class Keyframe:
     """A frame's crop round the object, and the mesh drawn there.
 
     seen: what the frame shows. drawn: with image, mask and coords, at ``T_view_ctr``. visible: (H, W), where the crop
@@ -74,7 +74,7 @@ class Look:
         return view.zoomed(Zoom(view.camera, self.seen.camera, self.seen.R_view_cam))
 
 
-def follow_points(before: Look, pose: Pose, after: View, model: ObjectModel) -> Points | None:
+def follow_points(before: Keyframe, pose: Pose, after: View, model: ObjectModel) -> Points | None:
     """Points of the object, and where they are in the next frame.
 
     before: the last frame's crop; pose: ``T_view_ctr`` in it, near the one at which it was drawn. after: the same crop
@@ -98,18 +98,18 @@ def follow_points(before: Look, pose: Pose, after: View, model: ObjectModel) -> 
         return None
     points = drawn.coords[rows, columns][steady].astype(np.float64) - model.center
     targets = camera.project(pose.apply(points)) + (places - corners)[steady]
-    return Points(points, targets, np.ones(len(points)), np.full(len(points), SIGMA), together=TOGETHER)
+    return Points(points, targets, np.ones(len(points)), np.full(len(points), SIGMA), correlated=CORRELATED)
 
 
-def match_texture(look: Look, model: ObjectModel) -> Points | None:
+def match_texture(keyframe: Keyframe, model: ObjectModel) -> Points | None:
     """Points of the mesh, as drawn, and where the frame shows the same texture; None where too few are alike.
 
     Both pictures are compared by their local contrast, since the light differs.
     """
-    drawn, camera = look.drawn, look.drawn.camera
+    drawn, camera = keyframe.drawn, keyframe.drawn.camera
     assert drawn.mask is not None and drawn.coords is not None
-    first, second = (_contrast(v.image) for v in (drawn, look.seen))
-    solid = drawn.mask & look.visible & look.seen.shown
+    first, second = (_contrast(v.image) for v in (drawn, keyframe.seen))
+    solid = drawn.mask & keyframe.visible & keyframe.seen.shown
     inside = cv2.erode(solid.astype(np.uint8), np.ones((7, 7), np.uint8))
     corners = cv2.goodFeaturesToTrack(first, CORNERS, TEXTURE_QUALITY, APART, mask=inside)
     if corners is None or len(corners) < LEAST:
@@ -126,8 +126,8 @@ def match_texture(look: Look, model: ObjectModel) -> Points | None:
     if (weight > 0).sum() < LEAST:
         return None
     points = drawn.coords[rows, columns].astype(np.float64) - model.center
-    targets = camera.project(look.T_view_ctr.apply(points)) + (places - corners)
-    return Points(points, targets, weight, np.full(len(points), TEXTURE_SIGMA), together=TEXTURE_TOGETHER)
+    targets = camera.project(keyframe.T_view_ctr.apply(points)) + (places - corners)
+    return Points(points, targets, weight, np.full(len(points), TEXTURE_SIGMA), correlated=TEXTURE_CORRELATED)
 
 
 def _contrast(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

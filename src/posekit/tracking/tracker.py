@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from posekit.align.colour_edge import Colours, Tint, learn, like_mesh, off_colour, outline_lines
-from posekit.align.fusion import Belief, Points, Term, fuse
+from posekit.align.gauss_newton import GaussianPose, Points, Residual, fuse
 from posekit.camera import Camera
 from posekit.errors import CameraError, ConfigError
 from posekit.estimate.estimator import PoseEstimator, nearest_to
@@ -30,7 +30,7 @@ from posekit.nets.pose_delta import apply_delta
 from posekit.nets.precision import usable_cores
 from posekit.nets.predictor import PairPrediction, Predictor
 from posekit.results import Branch, Detection, Estimate
-from posekit.tracking.points import Look, follow_points, match_texture
+from posekit.tracking.points import Keyframe, follow_points, match_texture
 from posekit.view import View
 
 TRACKED, RESTARTED, LOST = "tracked", "restarted", "lost"
@@ -41,7 +41,8 @@ GIVEN = (1.0, 0.5, 0.005)  # of a first pose
 AHEAD = (10.0, 8.0, 0.05)  # of the motion between two frames, where they are compared
 UNSEEN = (6.0, 4.0, 0.02)  # of that motion, when nothing else is known about it
 SUREST = (0.5, 0.15, 0.004)  # of any pose: errors last over many frames
-TOGETHER, DOUBTED = 25.0, math.radians(4.0)  # so many correspondences err alike, and at this predicted angle twice that
+CORRELATED = 25.0  # so many correspondences err alike
+DOUBTED = math.radians(4.0)  # at this predicted angle twice as many do
 TINTED = 0.15  # share of a frame in what is known of the tint
 FACES = 6000  # of the mesh that is drawn: a crop shows no more
 LEAST_SCALE, KNEE = 0.5, 2.5  # pixels, no correspondence is more exact; standard deviations
@@ -55,35 +56,33 @@ class Finder(Protocol):
 
 @dataclass(frozen=True)
 class TrackConfig:
-    """restart_deg, still_deg: predicted angles above which a frame is in doubt, and below which the network leaves the
-    pose to points and outline, both degrees. converged_deg: the predicted angle below which an estimate says
-    that it converged. iterations: comparisons of a frame at most; a second one follows a turn of
-    more than ``again_deg``. motion: where a frame's comparison starts: where followed points lead ("points"), the share
-    ``prior`` of the last motion once more ("velocity"), or the last pose ("none"). outline, texture: whether the
-    colours' place of the outline counts, and the mesh's texture where the frame shows it. mask: what a frame's mask is
-    taken to be: where the silhouette has the object's colours ("colours"), all of it ("pose"), or nothing ("none").
-    keep: share of what was known that holds for the next frame. alike: share of the silhouette with the object's
-    colours, below which a frame is in doubt. learn: share of a frame in these colours. least_inside: share of the
-    silhouette's box in the picture, likewise. doubts: frames in doubt in a row after which the object is lost. search:
-    frames between two attempts to find it. runtime: of the network."""
+    """How a `Tracker` follows an object."""
 
+    # restart_deg, still_deg: predicted angles above which a frame is in doubt, and below which the network leaves the
+    # pose to points and outline, both degrees
     restart_deg: float = 25.0
     still_deg: float = 0.0
-    converged_deg: float = 2.0
+    converged_deg: float = 2.0  # the predicted angle below which an estimate says that it converged
     again_deg: float = 8.0
-    iterations: int = 1
+    iterations: int = 1  # comparisons of a frame at most; a second one follows a turn of more than ``again_deg``
+    # where a frame's comparison starts: where followed points lead ("points"), the share ``prior`` of the last motion
+    # once more ("velocity"), or the last pose ("none")
     motion: str = "points"
     prior: float = 0.7
+    # outline, texture: whether the colours' place of the outline counts, and the mesh's texture where the frame shows
+    # it
     outline: bool = True
     texture: bool = True
+    # what a frame's mask is taken to be: where the silhouette has the object's colours ("colours"), all of it
+    # ("pose"), or nothing ("none")
     mask: str = "colours"
-    keep: float = 0.7
-    alike: float = 0.3
-    learn: float = 0.1
-    least_inside: float = 0.3
-    doubts: int = 3
-    search: int = 5
-    runtime: str = "openvino"
+    keep: float = 0.7  # share of what was known that holds for the next frame
+    alike: float = 0.3  # share of the silhouette with the object's colours, below which a frame is in doubt
+    learn: float = 0.1  # share of a frame in these colours
+    least_inside: float = 0.3  # share of the silhouette's box in the picture, likewise
+    doubts: int = 3  # frames in doubt in a row after which the object is lost
+    search: int = 5  # frames between two attempts to find it
+    runtime: str = "openvino"  # of the network
 
     def __post_init__(self) -> None:
         if not 0 <= self.still_deg < self.restart_deg <= 180:
@@ -153,13 +152,13 @@ class Tracker:
         self.predictor = predictor or _predictor(self.estimator, config)
         self.renderer, self.detector = self.estimator.renderer, detector
         self._drawn = model.simplified(FACES)
-        self._outline = model.outline - model.center
+        self._outline = model.hull_ctr
         self._beside = ThreadPoolExecutor(1, "posekit-network")
         self._given = pose  # a first pose that no frame has been seen with
         self._told = pose  # the last ``T_cam_obj`` that was told, whether or not the object was lost since
-        self._belief: Belief | None = None  # ``T_cam_ctr``
+        self._state: GaussianPose | None = None  # ``T_cam_ctr``
         self._motion = Pose.identity()  # of the object's centre and axes, from the frame before the last to the last
-        self._before: Look | None = None
+        self._before: Keyframe | None = None
         self._colours: Colours | None = None
         self._tint: Tint | None = None
         self._doubts = 0
@@ -183,8 +182,8 @@ class Tracker:
                 timings = {"network": network, "total": time.perf_counter() - started}
                 given = self._estimate(view, pose, prediction.angle, 0, 1.0, timings)
                 return Tracked(TRACKED, self._on_branch(given, Branch.GIVEN))
-        if self._belief is not None:
-            found = self._follow(view, self._belief)
+        if self._state is not None:
+            found = self._follow(view, self._state)
             if found is not None and not self._lost_sight(view, found):
                 return Tracked(TRACKED, self._on_branch(found))
             self._lose()
@@ -194,7 +193,7 @@ class Tracker:
 
     def _begin(self, view: View, pose: Pose, turn_std: float) -> bool:
         """Start from a first pose; whether the mesh is seen there. turn_std: radians."""
-        self._belief = self._before = self._colours = None
+        self._state = self._before = self._colours = None
         if not self._in_front(pose):
             return False
         seen, drawn = self._crops(view, pose)
@@ -203,25 +202,25 @@ class Tracker:
             return False
         centred = pose @ self.model.T_obj_ctr
         _, shift, depth = GIVEN
-        self._belief = Belief.about(centred, seen.camera, turn_std, shift, depth)
+        self._state = GaussianPose.about(centred, seen.camera, turn_std, shift, depth)
         visible = like_mesh(seen, drawn)
         if (visible & drawn.mask).sum() < 0.15 * drawn.mask.sum():
             visible = np.ones_like(visible)
         self._colours = learn(seen, drawn.mask, visible)
         self._tint = Tint.of(off_colour(seen, drawn), visible & drawn.mask)
-        self._before = Look(seen, drawn, Pose.rotation(seen.R_view_cam) @ centred, visible)
+        self._before = Keyframe(seen, drawn, Pose.rotation(seen.R_view_cam) @ centred, visible)
         return True
 
-    def _follow(self, view: View, last: Belief) -> Estimate | None:
+    def _follow(self, view: View, last: GaussianPose) -> Estimate | None:
         """From where the object is expected; None where it cannot be compared."""
         started, network, angle, comparisons = time.perf_counter(), 0.0, 0.0, 0
         before, colours, tint = self._before, self._colours, self._tint
         assert before is not None and colours is not None and tint is not None
         ahead = self._ahead(view, before, last, colours)
-        belief = ahead
+        state = ahead
         while comparisons < self.config.iterations:
             comparisons += 1
-            pose = belief.pose @ self.model.T_obj_ctr.inverse()
+            pose = state.pose @ self.model.T_ctr_obj
             if not self._in_front(pose):
                 return None
             seen, drawn = self._crops(view, pose)
@@ -230,41 +229,41 @@ class Tracker:
             visible = colours.seen(seen) & ~tint.hides(apart, drawn.mask)
             answer = self._beside.submit(self._asked, seen, drawn, visible)
             # while the network thinks
-            look = Look(seen, drawn, Pose.rotation(seen.R_view_cam) @ belief.pose, visible)
-            others = self._lines(look, seen, visible, colours) + self._texture(look)
+            keyframe = Keyframe(seen, drawn, Pose.rotation(seen.R_view_cam) @ state.pose, visible)
+            others = self._lines(keyframe, seen, visible, colours) + self._texture(keyframe)
             learned = colours.mixed(learn(seen, drawn.mask, visible), self.config.learn)
             tinted = tint.mixed(Tint.of(apart, visible & drawn.mask), TINTED)
-            look.prepare()
+            keyframe.prepare()
             prediction, seconds = answer.result()
             network, angle = network + seconds, prediction.angle
-            agreed = self._agreed(ahead, look, prediction, others)
+            agreed = self._agreed(ahead, keyframe, prediction, others)
             if agreed is None:
                 return None
-            turn = math.degrees(rotation_angle(agreed.pose.R @ belief.pose.R.T))
-            belief = agreed
+            turn = math.degrees(rotation_angle(agreed.pose.R @ state.pose.R.T))
+            state = agreed
             if turn < self.config.again_deg:
                 break
-        pose = belief.pose @ self.model.T_obj_ctr.inverse()
+        pose = state.pose @ self.model.T_ctr_obj
         if not self._in_front(pose):
             return None
         assert drawn.mask is not None
         shown = drawn.mask & seen.shown
         share = float((visible & shown).sum() / max(1, shown.sum()))
-        self._motion = Pose(belief.pose.R @ last.pose.R.T, belief.pose.t - last.pose.t)
-        self._belief, self._before = belief, look
+        self._motion = Pose(state.pose.R @ last.pose.R.T, state.pose.t - last.pose.t)
+        self._state, self._before = state, keyframe
         if angle < math.radians(self.config.restart_deg) and share > self.config.alike:
             self._colours = learned
         self._tint = tinted
         timings = {"network": network, "total": time.perf_counter() - started}
         return self._estimate(view, pose, angle, comparisons, share, timings)
 
-    def _ahead(self, view: View, before: Look, last: Belief, colours: Colours) -> Belief:
+    def _ahead(self, view: View, before: Keyframe, last: GaussianPose, colours: Colours) -> GaussianPose:
         """Where the object is expected, as ``T_cam_ctr``: from the last frame, without a comparison with the mesh."""
         camera, R = before.drawn.camera, before.seen.R_view_cam
         believed = last.turned(R)
         start = self._expected(believed.pose, R)
-        known: list[Term] = [_about(start, camera, AHEAD)]
-        motion: list[Term] = [_about(start, camera, UNSEEN)]
+        known: list[Residual] = [_about(start, camera, AHEAD)]
+        motion: list[Residual] = [_about(start, camera, UNSEEN)]
         seen = before.again(view)
         following = self._beside.submit(self._followed, before, start, seen)
         lines = self._lines(before, seen, before.visible, colours)
@@ -273,9 +272,9 @@ class Tracker:
         motion += points
         found = fuse(start, [*known, *lines], camera)
         pose = start if found is None else found.pose
-        moved = np.sum([term.equations(pose, camera)[0] for term in motion], axis=0)
+        moved = np.sum([residual.equations(pose, camera)[0] for residual in motion], axis=0)
         covariance = believed.covariance / self.config.keep + np.linalg.inv(moved)
-        return Belief(pose, np.asarray(np.linalg.inv(covariance))).turned(R.T)
+        return GaussianPose(pose, np.asarray(np.linalg.inv(covariance))).turned(R.T)
 
     def _expected(self, last: Pose, R_view_cam: NDArray[np.float64]) -> Pose:
         """``T_view_ctr`` after the last motion, where that is to be repeated."""
@@ -285,30 +284,32 @@ class Tracker:
         turn = so3_exp(R_view_cam @ so3_log(self._motion.R) * share)
         return Pose(turn @ last.R, last.t + share * (R_view_cam @ self._motion.t))
 
-    def _agreed(self, ahead: Belief, look: Look, prediction: PairPrediction, others: list[Term]) -> Belief | None:
+    def _agreed(
+        self, ahead: GaussianPose, keyframe: Keyframe, prediction: PairPrediction, others: list[Residual]
+    ) -> GaussianPose | None:
         """What the network, others that compare the mesh, and the frames before say together."""
-        camera, R = look.drawn.camera, look.seen.R_view_cam
-        network: list[Term] = []
+        camera, R = keyframe.drawn.camera, keyframe.seen.R_view_cam
+        network: list[Residual] = []
         if self.config.still_deg <= math.degrees(prediction.angle) < self.config.restart_deg:
-            network = self._network(look, prediction)
-        found = fuse(look.T_view_ctr, [ahead.turned(R), *network, *others], camera)
+            network = self._network(keyframe, prediction)
+        found = fuse(keyframe.T_view_ctr, [ahead.turned(R), *network, *others], camera)
         if found is None:
             return None
         return found.spread(_about(found.pose, camera, SUREST).covariance).turned(R.T)
 
-    def _followed(self, before: Look, start: Pose, seen: View) -> list[Term]:
+    def _followed(self, before: Keyframe, start: Pose, seen: View) -> list[Residual]:
         found = follow_points(before, start, seen, self.model) if self.config.motion == "points" else None
         return [] if found is None else [found]
 
-    def _texture(self, look: Look) -> list[Term]:
-        found = match_texture(look, self.model) if self.config.texture else None
+    def _texture(self, keyframe: Keyframe) -> list[Residual]:
+        found = match_texture(keyframe, self.model) if self.config.texture else None
         return [] if found is None else [found]
 
-    def _lines(self, look: Look, seen: View, visible: NDArray[np.bool_], colours: Colours) -> list[Term]:
-        """Where the mesh's outline, as it was drawn for ``look``, lies in a crop of the same camera."""
+    def _lines(self, keyframe: Keyframe, seen: View, visible: NDArray[np.bool_], colours: Colours) -> list[Residual]:
+        """Where the mesh's outline, as it was drawn for ``keyframe``, lies in a crop of the same camera."""
         if not self.config.outline:
             return []
-        lines = outline_lines(seen, look.drawn, colours, visible, self.model.center, look.outline)
+        lines = outline_lines(seen, keyframe.drawn, colours, visible, self.model.center, keyframe.outline)
         return [] if lines is None else [lines]
 
     def _crops(self, view: View, pose: Pose) -> tuple[View, View]:
@@ -324,25 +325,25 @@ class Tracker:
         [prediction] = self.predictor.predict([seen.with_mask(mask)], [drawn])
         return prediction, time.perf_counter() - started
 
-    def _network(self, look: Look, prediction: PairPrediction) -> list[Term]:
+    def _network(self, keyframe: Keyframe, prediction: PairPrediction) -> list[Residual]:
         """The network's correspondences, or where it has none, the pose it leads to."""
-        found, camera = prediction.correspondences, look.drawn.camera
+        found, camera = prediction.correspondences, keyframe.drawn.camera
         if found is None:
-            target = apply_delta(look.T_view_ctr, prediction.delta, camera.fx)
+            target = apply_delta(keyframe.T_view_ctr, prediction.delta, camera.fx)
             spread = max(prediction.angle, math.radians(GIVEN[0]))
-            return [Belief.about(target, camera, spread, 1.0, 0.02)] if target.t[2] > 0 else []
-        assert look.drawn.coords is not None
-        points = look.drawn.coords[found.source[:, 1], found.source[:, 0]] - self.model.center
+            return [GaussianPose.about(target, camera, spread, 1.0, 0.02)] if target.t[2] > 0 else []
+        assert keyframe.drawn.coords is not None
+        points = keyframe.drawn.coords[found.source[:, 1], found.source[:, 0]] - self.model.center
         if not len(points):
             return []
-        together = TOGETHER * (1 + (prediction.angle / DOUBTED) ** 2)
+        correlated = CORRELATED * (1 + (prediction.angle / DOUBTED) ** 2)
         scale = np.maximum(found.scale_px, LEAST_SCALE)
-        return [Points(points.astype(np.float64), found.target, found.weight, scale, KNEE, together)]
+        return [Points(points.astype(np.float64), found.target, found.weight, scale, KNEE, correlated)]
 
     def _estimate(
         self, view: View, pose: Pose, angle: float, iterations: int, score: float, timings: dict[str, float]
     ) -> Estimate:
-        box = view.camera.points_box(_before_camera(pose.apply(self.model.outline)))
+        box = view.camera.points_box(_before_camera(pose.apply(self.model.hull_vertices)))
         converged = angle < math.radians(self.config.converged_deg)
         return Estimate(pose, angle, iterations, converged, score, box, self.model.name, timings=timings)
 
@@ -375,7 +376,7 @@ class Tracker:
         return share == 0 or self._doubts >= self.config.doubts
 
     def _lose(self) -> None:
-        self._belief = self._before = self._colours = None
+        self._state = self._before = self._colours = None
         self._motion, self._doubts, self._waiting = Pose.identity(), 0, 0
 
     def _find(self, view: View) -> Tracked:
@@ -393,9 +394,9 @@ class Tracker:
         return Tracked(RESTARTED, self._on_branch(found.instances[0]))
 
 
-def _about(pose: Pose, camera: Camera, spread: tuple[float, float, float]) -> Belief:
+def _about(pose: Pose, camera: Camera, spread: tuple[float, float, float]) -> GaussianPose:
     turn, shift, depth = spread
-    return Belief.about(pose, camera, math.radians(turn), shift, depth)
+    return GaussianPose.about(pose, camera, math.radians(turn), shift, depth)
 
 
 def _predictor(estimator: PoseEstimator, config: TrackConfig) -> Predictor:

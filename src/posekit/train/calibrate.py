@@ -61,11 +61,11 @@ def passed_poses(
         for k, case in enumerate(cases):
             if tell is not None:
                 tell(k, len(cases))
-            pose, outline = _start(case, k), case.model.outline - case.model.center
+            pose, hull = _start(case, k), case.model.hull_ctr
             for n in range(iterations):
-                [found], [seen], [drawn] = compare(case.view, case.model, outline, [pose], predictor, renderer)
+                [found], [seen], [drawn] = compare(case.view, case.model, hull, [pose], predictor, renderer)
                 angles.append(_error(pose, case))
-                updated = update_pose(pose, case.model, found, seen, drawn, update, outline=True)
+                updated = update_pose(pose, case.model, found, seen, drawn, update, colour_edge=True)
                 last.append(updated is None or n == iterations - 1)
                 if updated is None:
                     break
@@ -119,7 +119,7 @@ def _start(case: Case, k: int) -> Pose:
         return case.start
     T_cam_ctr = case.start @ case.model.T_obj_ctr
     turned = Pose(random_rotation(np.random.default_rng([SEED, k])), T_cam_ctr.t)
-    return turned @ case.model.T_obj_ctr.inverse()
+    return turned @ case.model.T_ctr_obj
 
 
 def _error(pose: Pose, case: Case) -> float:

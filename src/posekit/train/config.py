@@ -31,17 +31,16 @@ def _one_of(name: str, value: str, choices: tuple[str, ...]) -> None:
 
 @dataclass(frozen=True)
 class OptimiserConfig:
-    """rate: the highest learning rate. warmup: steps until it is reached. floor: its share at the end of the cosine.
-    decay: weight decay. clip: largest norm of the gradient. ema: decay of the averaged weights per step."""
+    """The optimiser and its schedule."""
 
     kind: str = "adamw"
-    rate: float = 5e-4
-    warmup: int = 300
-    floor: float = 0.02
-    decay: float = 1e-4
+    rate: float = 5e-4  # the highest learning rate
+    warmup: int = 300  # steps until it is reached
+    floor: float = 0.02  # its share at the end of the cosine
+    decay: float = 1e-4  # weight decay
     momentum: float = 0.9
-    clip: float = 1.0
-    ema: float = 0.998
+    clip: float = 1.0  # largest norm of the gradient
+    ema: float = 0.998  # decay of the averaged weights per step
 
     def __post_init__(self) -> None:
         _one_of("optimiser.kind", self.kind, OPTIMISERS)
@@ -53,16 +52,15 @@ class OptimiserConfig:
 
 @dataclass(frozen=True)
 class MachineConfig:
-    """threads: of torch in each process; 0 = its own choice. workers: processes that render for each process.
-    devices, nodes: processes per machine and machines. accelerator: Lightning Fabric's name. precision: "auto" is
-    bfloat16 where the processor multiplies in it, else float32."""
+    """What a training runs on."""
 
-    accelerator: str = "auto"
+    accelerator: str = "auto"  # Lightning Fabric's name
+    # devices, nodes: processes per machine and machines
     devices: int = 1
     nodes: int = 1
-    precision: str = "auto"
-    threads: int = 0
-    workers: int = 1
+    precision: str = "auto"  # "auto" is bfloat16 where the processor multiplies in it, else float32
+    threads: int = 0  # of torch in each process; 0 = its own choice
+    workers: int = 1  # processes that render for each process
 
     def __post_init__(self) -> None:
         _one_of("machine.precision", self.precision, PRECISIONS)
@@ -72,45 +70,41 @@ class MachineConfig:
 
 @dataclass(frozen=True)
 class SourceConfig:
-    """What is trained on. models: mesh files. meshes: folders of mesh files. bop: folders in BOP layout with a weight
-    each, as ``FOLDER``, ``FOLDER:SPLIT`` or ``FOLDER:SPLIT=WEIGHT`` (paper recipe). renders: weight of renderings
-    beside them. distractors: folders of meshes that lie about in a detector's scenes and are not to be found.
-    backgrounds: a folder of photographs. init: weights to start from; empty = none. flownets: a FlowNetS
-    checkpoint for the paper's encoder. validate_on: a folder in BOP layout."""
+    """What is trained on."""
 
-    models: tuple[str, ...] = ()
+    models: tuple[str, ...] = ()  # mesh files
     units: str = "auto"
-    meshes: tuple[str, ...] = ()
+    meshes: tuple[str, ...] = ()  # folders of mesh files
+    # folders in BOP layout with a weight each, as ``FOLDER``, ``FOLDER:SPLIT`` or ``FOLDER:SPLIT=WEIGHT`` (paper
+    # recipe)
     bop: tuple[str, ...] = ()
-    renders: float = 1.0
+    renders: float = 1.0  # weight of renderings beside them
+    # folders of meshes that lie about in a detector's scenes and are not to be found
     distractors: tuple[str, ...] = ()
-    backgrounds: str = ""
-    init: str = ""
-    flownets: str = ""
-    validate_on: str = ""
+    backgrounds: str = ""  # a folder of photographs
+    init: str = ""  # weights to start from; empty = none
+    flownets: str = ""  # a FlowNetS checkpoint for the paper's encoder
+    validate_on: str = ""  # a folder in BOP layout
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """steps: optimiser steps of the schedule. minutes: of wall clock, where above 0; whichever ends first. epochs:
-    where above 0, the steps follow from the sources (paper recipe). validate, save, log: every so many steps.
-    export_seconds: weights and a checkpoint are written every so many seconds too, where above 0. keep: checkpoints
-    kept beside the best. overfit: train on the first batch again and again. cases: held-back renderings that the loop
-    is measured on. calibrate: renderings that the angle head is fitted on at the end; 0 = not at all."""
+    """A training."""
 
     recipe: str = "lite"
-    steps: int = 7000
-    minutes: float = 0.0
-    epochs: int = 0
+    steps: int = 7000  # optimiser steps of the schedule
+    minutes: float = 0.0  # of wall clock, where above 0; whichever ends first
+    epochs: int = 0  # where above 0, the steps follow from the sources (paper recipe)
     seed: int = 1
+    # validate, save, log: every so many steps
     validate: int = 500
-    export_seconds: float = 60.0
+    export_seconds: float = 60.0  # weights and a checkpoint are written every so many seconds too, where above 0
     save: int = 250
     log: int = 50
-    keep: int = 3
-    cases: int = 48
-    calibrate: int = 240
-    overfit: bool = False
+    keep: int = 3  # checkpoints kept beside the best
+    cases: int = 48  # held-back renderings that the loop is measured on
+    calibrate: int = 240  # renderings that the angle head is fitted on at the end; 0 = not at all
+    overfit: bool = False  # train on the first batch again and again
     profile: bool = False
     optimiser: OptimiserConfig = OptimiserConfig()
     machine: MachineConfig = MachineConfig()

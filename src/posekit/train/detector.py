@@ -49,12 +49,11 @@ HELD_BACK = 1_000_003  # the seed of the validation's scenes, apart from all tha
 
 @dataclass(frozen=True)
 class DetectorConfig:
-    """agnostic: learn objects of any kind, procedural ones beside the given meshes. epochs: of ``epoch`` scenes each,
-    where above 0; they give the steps. scenes: of the validation. The rest is as `TrainConfig` has it."""
+    """The training of a detector."""
 
     recipe: str = "detector"
-    agnostic: bool = False
-    epochs: int = 10
+    agnostic: bool = False  # learn objects of any kind, procedural ones beside the given meshes
+    epochs: int = 10  # of ``epoch`` scenes each, where above 0; they give the steps
     epoch: int = 2000
     steps: int = 5000
     minutes: float = 0.0
@@ -64,7 +63,7 @@ class DetectorConfig:
     save: int = 250
     log: int = 20
     keep: int = 2
-    scenes: int = 24
+    scenes: int = 24  # of the validation. The rest is as `TrainConfig` has it.
     overfit: bool = False
     profile: bool = False
     optimiser: OptimiserConfig = OptimiserConfig("sgd", 5e-3, warmup=200, floor=0.02, decay=5e-4, clip=10.0, ema=0.995)

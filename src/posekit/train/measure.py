@@ -72,7 +72,7 @@ def rendered_cases(source: CaseSource, renderer: Renderer, count: int, seed: int
             picture, _ = observe(scene.rgba, others, photos, replace(augment, no_mask=0.0), rng)
             others.append(scene.rgba)
             view = view_of(picture, scene.camera)
-            truth = scene.T_view_ctr @ shown.T_obj_ctr.inverse()
+            truth = scene.T_view_ctr @ shown.T_ctr_obj
             detection = Detection(disturbed_box(scene.box, config, rng), mask=view.mask, source=Source.MASK)
             cases.append(_case(view, known, truth, detection, rng))
     return cases
@@ -95,7 +95,7 @@ def bop_cases(dataset: BopDataset, count: int) -> list[Case]:
 
 def _case(view: View, model: ObjectModel, truth: Pose, detection: Detection, rng: np.random.Generator) -> Case:
     """Starts from DeepIM's disturbance."""
-    start = disturbed_pose(truth @ model.T_obj_ctr, model.diameter, rng) @ model.T_obj_ctr.inverse()
+    start = disturbed_pose(truth @ model.T_obj_ctr, model.diameter, rng) @ model.T_ctr_obj
     return Case(view, model, truth, start, detection)
 
 
@@ -133,7 +133,7 @@ def _errors(cases: Sequence[Case], poses: Sequence[Pose]) -> dict[str, float]:
     distances = [
         min(
             0.5,
-            min(float(add(p, c.truth @ S, c.model.outline)) for S in c.model.symmetries.transforms())
+            min(float(add(p, c.truth @ S, c.model.hull_vertices)) for S in c.model.symmetries.transforms())
             / c.model.diameter,
         )
         for p, c in zip(poses, cases, strict=True)

@@ -124,7 +124,7 @@ class PaperModule(nn.Module):
     def _crop(self, scene: _Scene, pose: Pose) -> _Crop:
         """Zoom to a pose and render the object there."""
         crop = zoomed(scene, pose, self.size)
-        T_view_obj = crop.source @ scene.model.T_obj_ctr.inverse()
+        T_view_obj = crop.source @ scene.model.T_ctr_obj
         (drawn,) = self.renderer.render(scene.model, [T_view_obj], crop.zoom.camera, coords=False)
         observed = view_of(scene.picture, scene.camera).zoomed(crop.zoom)
         return replace(crop, observed=rgba_of(observed), rendered=rgba_of(drawn))
@@ -138,7 +138,7 @@ class PaperModule(nn.Module):
 
 def zoomed(scene: _Scene, pose: Pose, size: tuple[int, int]) -> _Crop:
     """The window of ``size`` round a pose, and what there is to learn in it, without pictures."""
-    zoom = zoom_to_pose(scene.camera, pose, scene.model.outline - scene.model.center, size)
+    zoom = zoom_to_pose(scene.camera, pose, scene.model.hull_ctr, size)
     turn = Pose.rotation(zoom.R_view_cam)
     source = turn @ pose
     return _Crop(zoom, source, delta_between(source, turn @ scene.truth, zoom.camera.fx))

@@ -56,7 +56,7 @@ def outlined(
     renderer: Renderer, image: Image, camera: Camera, model: ObjectModel, T_cam_obj: Pose, colour: Colour = draw.GREEN
 ) -> Image:
     """A picture with the outline that a mesh has in this pose: the silhouette's outermost pixels."""
-    points = T_cam_obj.apply(model.outline)
+    points = T_cam_obj.apply(model.hull_vertices)
     points[:, 2] = np.maximum(points[:, 2], 1e-3)
     x0, y0, x1, y1 = camera.points_box(points)
     left, top = max(0, math.floor(x0) - 3), max(0, math.floor(y0) - 3)  # room for the rim

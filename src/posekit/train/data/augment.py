@@ -20,32 +20,26 @@ LEVELS = np.arange(256, dtype=np.float64)[:, None].repeat(3, 1)  # (256, 3)
 
 @dataclass(frozen=True)
 class AugmentConfig:
-    """Probabilities and ranges; lengths in pixels of a crop 160 wide.
+    """Probabilities and ranges; lengths in pixels of a crop 160 wide."""
 
-    photo: share of photo backgrounds, where photos are at hand. clutter: most objects pasted behind.
-    camouflage: share of backgrounds that take on the object's own colours. soft: share of objects whose edges mix with
-    what is behind. occluded: share with something in front. shrink: the observed crop is shrunk by up to this and
-    re-enlarged, since real objects are small. dilate: largest dilation of the mask (the
-    paper's 40 px at 640x480). grown: share of the masks of another size that are too large, not too small; the
-    paper's are always too large, and a network that learned from such masks alone takes an exact one for too large
-    and the object for smaller and further away than it is. no_mask, box_mask, cut_mask: shares of masks left out,
-    replaced by the filled box, and cut in part. tone: how far exposure, contrast
-    and white balance stray, 0 = not at all. harsh: share of pictures with one of MegaPose's stronger changes: little or
-    much contrast, brightness or colour, grey, sharpened.
-    """
-
-    photo: float = 0.75
-    clutter: int = 4
-    camouflage: float = 0.2
-    soft: float = 0.8
-    occluded: float = 0.45
-    shrink: float = 3.0
-    dilate: int = 10
+    photo: float = 0.75  # share of photo backgrounds, where photos are at hand
+    clutter: int = 4  # most objects pasted behind
+    camouflage: float = 0.2  # share of backgrounds that take on the object's own colours
+    soft: float = 0.8  # share of objects whose edges mix with what is behind
+    occluded: float = 0.45  # share with something in front
+    shrink: float = 3.0  # the observed crop is shrunk by up to this and re-enlarged, since real objects are small
+    dilate: int = 10  # largest dilation of the mask (the paper's 40 px at 640x480)
+    # share of the masks of another size that are too large, not too small; the paper's are always too large, and a
+    # network that learned from such masks alone takes an exact one for too large and the object for smaller and
+    # further away than it is
     grown: float = 0.5
+    # no_mask, box_mask, cut_mask: shares of masks left out, replaced by the filled box, and cut in part
     no_mask: float = 0.15
     box_mask: float = 0.12
     cut_mask: float = 0.08
-    tone: float = 1.0
+    tone: float = 1.0  # how far exposure, contrast and white balance stray, 0 = not at all
+    # share of pictures with one of MegaPose's stronger changes: little or much contrast, brightness or colour, grey,
+    # sharpened
     harsh: float = 0.35
 
 

@@ -28,19 +28,17 @@ Rng = np.random.Generator
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """crop: (width, height) of the networks' crops. oversize: how much larger a scene's picture is. margin: how much
-    wider than the object it looks. distance: range in diameters. shift: how far from the middle the object may lie, in
-    its own half widths. box_shift, box_scale: standard deviations of a detection box's error, in its own size.
-    visible: least visible share of a photographed object."""
+    """How scenes of one object before a photograph are drawn."""
 
-    crop: tuple[int, int] = (160, 120)
-    oversize: float = 1.5
-    margin: tuple[float, float] = (1.5, 2.2)
-    distance: tuple[float, float] = (3.0, 14.0)
-    shift: float = 0.3
+    crop: tuple[int, int] = (160, 120)  # (width, height) of the networks' crops
+    oversize: float = 1.5  # how much larger a scene's picture is
+    margin: tuple[float, float] = (1.5, 2.2)  # how much wider than the object it looks
+    distance: tuple[float, float] = (3.0, 14.0)  # range in diameters
+    shift: float = 0.3  # how far from the middle the object may lie, in its own half widths
+    # box_shift, box_scale: standard deviations of a detection box's error, in its own size
     box_shift: float = 0.04
     box_scale: float = 0.06
-    visible: float = 0.3
+    visible: float = 0.3  # least visible share of a photographed object
 
     @property
     def size(self) -> tuple[int, int]:
@@ -72,7 +70,7 @@ class Frontal:
     def of(cls, model: ObjectModel, renderer: Renderer, crop: tuple[int, int]) -> Frontal:
         """crop: (width, height)."""
         camera, distance = frontal_camera(model, crop)
-        poses = [Pose(R, np.array([0, 0, distance])) @ model.T_obj_ctr.inverse() for R in cube_views()]
+        poses = [Pose(R, np.array([0, 0, distance])) @ model.T_ctr_obj for R in cube_views()]
         drawn = renderer.render(model, poses, camera, coords=False)
         return cls(np.stack([rgba_of(v) for v in drawn]), camera, distance)
 
@@ -91,7 +89,7 @@ class BoxSample:
 
 def render_scenes(renderer: Renderer, model: ObjectModel, count: int, config: SceneConfig, rng: Rng) -> list[Scene]:
     """At most ``count`` scenes of one object from all sides; a pose from which nothing is seen is left out."""
-    outline = model.outline - model.center
+    outline = model.hull_ctr
     whole = Camera.from_fov(1.0, *config.size)
     poses, cameras = [], []
     for _ in range(count):
@@ -101,7 +99,7 @@ def render_scenes(renderer: Renderer, model: ObjectModel, count: int, config: Sc
         side = 0.5 * model.diameter * rng.uniform(-config.shift, config.shift, size=2)
         poses.append(Pose(pose.R, pose.t + [*side, 0.0]))
         cameras.append(zoom.camera)
-    T_ctr_obj = model.T_obj_ctr.inverse()
+    T_ctr_obj = model.T_ctr_obj
     lights = [random_light(rng) for _ in range(count)]
     drawn = renderer.render(model, [p @ T_ctr_obj for p in poses], cameras, light=lights, coords=False)
     return [Scene(rgba_of(view), view.camera, pose, box)

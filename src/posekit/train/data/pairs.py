@@ -28,23 +28,21 @@ DEPTH_TOLERANCE = 0.02  # of the diameter: nearer than that counts as the same s
 
 @dataclass(frozen=True)
 class PairConfig:
-    """How pairs are drawn. The noise is DeepIM's, scaled by the drawn magnitude and the object's diameter.
+    """How pairs are drawn. The noise is DeepIM's, scaled by the drawn magnitude and the object's diameter."""
 
-    size: (width, height) of the crop. distance: range of the distance in diameters. small, wide, lost: shares of
-    pairs with less noise than DeepIM's (late iterations), with more (bad first poses, up to ``widest`` times as much),
-    and in another basin altogether (only angle, score and silhouettes learn from them). flipped: of the lost ones,
-    those turned by about half a turn, whose outline is often right. unlike, deformed: see `appearance.variants`.
-    """
-
-    size: tuple[int, int] = (128, 96)
-    distance: tuple[float, float] = (3.0, 14.0)
+    size: tuple[int, int] = (128, 96)  # (width, height) of the crop
+    distance: tuple[float, float] = (3.0, 14.0)  # range of the distance in diameters
     noise: PoseNoise = PoseNoise()
+    # small, wide, lost: shares of pairs with less noise than DeepIM's (late iterations), with more (bad first poses,
+    # up to ``widest`` times as much), and in another basin altogether (only angle, score and silhouettes learn from
+    # them)
     small: float = 0.35
     wide: float = 0.22
     widest: float = 1.8
     lost: float = 0.12
-    flipped: float = 0.5
+    flipped: float = 0.5  # of the lost ones, those turned by about half a turn, whose outline is often right
     enlarge: tuple[float, float] = (1.25, 1.6)
+    # unlike, deformed: see `appearance.variants`
     unlike: float = 0.35
     deformed: float = 0.15
 
@@ -117,8 +115,8 @@ def render_pairs(
 ) -> list[Pair]:
     """``count`` pairs of one object, drawn in two batches. photos: to cut other paint from."""
     rendered, observed = variants(model, photos, config.unlike, config.deformed, rng)
-    outline = model.outline - model.center
-    T_ctr_obj = model.T_obj_ctr.inverse()
+    outline = model.hull_ctr
+    T_ctr_obj = model.T_ctr_obj
     sources, targets, cameras, lost = [], [], [], []
     whole = Camera.from_fov(1.0, *config.size)
     for _ in range(count):

@@ -53,20 +53,16 @@ QUERIED = 12  # meshes that a shard keeps for MV-Net's queries
 
 @dataclass(frozen=True)
 class StreamConfig:
-    """batch: pairs in a process's batch. shard: pairs drawn from one pool at most; the greatest common divisor with
-    the batch counts. pool: pairs kept for a batch, over all its shards. reuse: how often a pair is used, with fresh
-    augmentation. per_object: pairs rendered of one object at a time. serves: how often an object is rendered.
-    mvnet: MV-Net's queries in a batch, a multiple of the number of shards; 0 = none. share: share of the user's meshes
-    where procedural ones are wanted too."""
+    """How training samples are drawn and shared."""
 
-    batch: int = 32
-    shard: int = 8
-    pool: int = 1024
-    reuse: int = 3
-    per_object: int = 8
-    serves: int = 3
-    mvnet: int = 0
-    share: float = 1.0
+    batch: int = 32  # pairs in a process's batch
+    shard: int = 8  # pairs drawn from one pool at most; the greatest common divisor with the batch counts
+    pool: int = 1024  # pairs kept for a batch, over all its shards
+    reuse: int = 3  # how often a pair is used, with fresh augmentation
+    per_object: int = 8  # pairs rendered of one object at a time
+    serves: int = 3  # how often an object is rendered
+    mvnet: int = 0  # MV-Net's queries in a batch, a multiple of the number of shards; 0 = none
+    share: float = 1.0  # share of the user's meshes where procedural ones are wanted too
     pairs: PairConfig = PairConfig()
     scenes: SceneConfig = SceneConfig()
     queries: QueryConfig = QueryConfig()

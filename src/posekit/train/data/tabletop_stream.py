@@ -26,17 +26,15 @@ AGNOSTIC_SHARE = 0.5  # of given meshes among the objects of class-agnostic scen
 
 @dataclass(frozen=True)
 class TabletopStreamConfig:
-    """batch: scenes in a batch. pool: scenes kept to draw from. reuse: how often each is used, mirrored and
-    photographed anew. per_block: scenes composed from one set of procedural meshes. meshes: procedural meshes in
-    a set. visible: least visible share of an instance that is to be found. least_px: its least visible pixels."""
+    """How a detector sees scenes on tables."""
 
-    batch: int = 4
-    pool: int = 64
-    reuse: int = 5
-    per_block: int = 8
-    meshes: int = 6
-    visible: float = 0.1
-    least_px: int = 40
+    batch: int = 4  # scenes in a batch
+    pool: int = 64  # scenes kept to draw from
+    reuse: int = 5  # how often each is used, mirrored and photographed anew
+    per_block: int = 8  # scenes composed from one set of procedural meshes
+    meshes: int = 6  # procedural meshes in a set
+    visible: float = 0.1  # least visible share of an instance that is to be found
+    least_px: int = 40  # its least visible pixels
     scenes: TabletopConfig = TabletopConfig(size=(320, 240))
     augment: AugmentConfig = AugmentConfig(shrink=1.8)
 

@@ -34,32 +34,25 @@ Rng = np.random.Generator
 
 @dataclass(frozen=True)
 class QueryConfig:
-    """crop: (width, height). enlarge: the crop's size in boxes. views: directions; drawn: those of them that a training
-    bank renders. templates: in a group, of one mesh.
-    kept: of these, compared closely with a query; nearest: those among them nearest to the truth. queries: in a group.
-    absent: share of the queries that do not show the mesh; empty: share of these that show no other object either.
-    distance: range in diameters. box: how far a box is shifted and scaled at most, in its size. cut: share of the
-    boxes that lack up to 40 % at one side, as where something hides it. plain: share of meshes whose views, and
-    plain_scene: of objects that, have other colours or none. tolerance: how near a point of the surface must be to
-    count as the same, in diameters. swing_deg, twist_deg: standard deviations of what counts as near, of directions
-    and of turns."""
+    """How MV-Net's samples are drawn."""
 
-    crop: tuple[int, int] = (128, 96)
-    enlarge: float = 1.35
-    views: int = 42
-    drawn: int = 20
-    templates: int = 32
-    kept: int = 8
-    nearest: int = 3
-    queries: int = 8
-    absent: float = 0.25
-    empty: float = 0.2
-    distance: tuple[float, float] = (3.0, 14.0)
-    box: float = 0.25
-    cut: float = 0.15
-    plain: float = 0.33
+    crop: tuple[int, int] = (128, 96)  # (width, height)
+    enlarge: float = 1.35  # the crop's size in boxes
+    views: int = 42  # directions;
+    drawn: int = 20  # those of them that a training bank renders
+    templates: int = 32  # in a group, of one mesh
+    kept: int = 8  # of these, compared closely with a query;
+    nearest: int = 3  # those among them nearest to the truth
+    queries: int = 8  # in a group
+    absent: float = 0.25  # share of the queries that do not show the mesh;
+    empty: float = 0.2  # share of these that show no other object either
+    distance: tuple[float, float] = (3.0, 14.0)  # range in diameters
+    box: float = 0.25  # how far a box is shifted and scaled at most, in its size
+    cut: float = 0.15  # share of the boxes that lack up to 40 % at one side, as where something hides it
+    plain: float = 0.33  # share of meshes whose views, and plain_scene: of objects that, have other colours or none
     plain_scene: float = 0.1
-    tolerance: float = 0.06
+    tolerance: float = 0.06  # how near a point of the surface must be to count as the same, in diameters
+    # swing_deg, twist_deg: standard deviations of what counts as near, of directions and of turns
     swing_deg: float = 18.0
     twist_deg: float = 35.0
 
@@ -163,7 +156,7 @@ def render_queries(
     """At most ``count`` crops of an object from all sides; those in which hardly anything is seen are left out."""
     look = faded(model, str(rng.choice(FADED)), rng) if rng.random() < config.plain_scene else model
     whole = Camera.from_fov(0.8, 640, 480)
-    outline = model.outline - model.center
+    outline = model.hull_ctr
     poses, cameras = [], []
     for _ in range(count):
         distance = model.diameter * float(np.exp(rng.uniform(*np.log(config.distance))))
@@ -172,7 +165,7 @@ def render_queries(
                            enlarge=config.enlarge)  # fmt: skip
         poses.append(Pose.rotation(zoom.R_view_cam) @ pose)
         cameras.append(zoom.camera)
-    T_ctr_obj = model.T_obj_ctr.inverse()
+    T_ctr_obj = model.T_ctr_obj
     placed = [pose @ T_ctr_obj for pose in poses]
     drawn = renderer.render(look, placed, cameras, light=[random_light(rng) for _ in range(count)], coords=False)
     h, w = config.cells

@@ -1,6 +1,6 @@
 """How often an object is found in photographs that do not show it, and how long it takes to say so.
 
-    python benchmarks/alarms.py ROOT MESH [MESH ...] [--units m] [--detector novel|FILE] [--images 50]
+    python benchmarks/false_positives.py ROOT MESH [MESH ...] [--units m] [--detector novel|FILE] [--images 50]
 
 ROOT is a data set in BOP layout, whose pictures show none of the meshes. Each picture is searched for one of them, in
 turn, as `posekit estimate` does it. Prints the share of pictures in which something is found, at the default score and
@@ -43,14 +43,16 @@ def main() -> None:
         started = time.perf_counter()
         found = detector.detect(view, [model])
         detected = time.perf_counter()
-        [best] = find_instances(estimators, view, [model], found, SearchOptions(least=0.0))
+        [best] = find_instances(estimators, view, [model], found, SearchOptions(min_score=0.0))
         seconds.append((detected - started, time.perf_counter() - detected))
         scores.append(best.instances[0].score if best.instances else 0.0)
         print(f"{pictures[k]} {model.name}: {len(found)} detections, best estimate {scores[-1]:.2f}", flush=True)
-    usual = SearchOptions().least
-    for least in sorted({usual, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 0.9}):
-        alarms = sum(score >= least for score in scores)
-        print(f"score from {least:g}{' (default)' if least == usual else ''}: found in {alarms} of {len(scores)}")
+    usual = SearchOptions().min_score
+    for min_score in sorted({usual, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 0.9}):
+        alarms = sum(score >= min_score for score in scores)
+        print(
+            f"score from {min_score:g}{' (default)' if min_score == usual else ''}: found in {alarms} of {len(scores)}"
+        )
     detect, estimate = np.mean(seconds[1:] or seconds, axis=0)
     print(f"seconds of a picture: detect {detect:.2f}, estimate {estimate:.2f}")
 

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from objects import bracket
-from posekit.align.mask_edge import fit_contour
+from posekit.align.mask_edge import fit_mask_edge
 from posekit.camera import Camera
 from posekit.estimate.refine import pose_change
 from posekit.geometry import Pose, PoseNoise, random_rotation
@@ -37,7 +37,7 @@ def cases(model: ObjectModel, renderer: Renderer, count: int = 6) -> list[tuple[
     for _ in range(count):
         truth = Pose(random_rotation(rng), np.array([*rng.uniform(-0.05, 0.05, 2), 6 * model.diameter]))
         [drawn] = renderer.render(model, [truth], CAMERA, coords=False)
-        near = NOISE.disturb(truth @ model.T_obj_ctr, rng) @ model.T_obj_ctr.inverse()
+        near = NOISE.disturb(truth @ model.T_obj_ctr, rng) @ model.T_ctr_obj
         found.append((drawn, truth, near))
     return found
 
@@ -54,7 +54,7 @@ def rough(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def test_an_exact_mask_gives_the_pose(model: ObjectModel, renderer: Renderer) -> None:
     before, after = [], []
     for view, truth, near in cases(model, renderer):
-        fit = fit_contour(view, model, near, renderer)
+        fit = fit_mask_edge(view, model, near, renderer)
         assert fit is not None and fit.exact and fit.covered > 0.95 and 0 < fit.turn_std < np.deg2rad(3)
         before.append(pose_change(near, truth))
         after.append(pose_change(fit.T_cam_obj, truth))
@@ -68,7 +68,7 @@ def test_a_mask_may_be_too_large_all_round(model: ObjectModel, renderer: Rendere
     for view, truth, near in cases(model, renderer):
         assert view.mask is not None
         grown = cv2.dilate(view.mask.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))) > 0
-        fit = fit_contour(view.with_mask(grown), model, near, renderer)
+        fit = fit_mask_edge(view.with_mask(grown), model, near, renderer)
         assert fit is not None
         turns.append(pose_change(fit.T_cam_obj, truth)[0])
         depths.append(abs(fit.T_cam_obj.t[2] / truth.t[2] - 1))
@@ -82,7 +82,7 @@ def test_a_part_may_be_hidden(model: ObjectModel, renderer: Renderer) -> None:
         columns = np.flatnonzero(view.mask.any(0))
         seen = view.mask.copy()
         seen[:, : int(np.quantile(columns, 0.25))] = False
-        fit = fit_contour(view.with_mask(seen), model, near, renderer)
+        fit = fit_mask_edge(view.with_mask(seen), model, near, renderer)
         assert fit is not None and fit.covered < 0.97
         turns.append(pose_change(fit.T_cam_obj, truth)[0])
     assert np.rad2deg(np.median(turns)) < 1.0
@@ -91,14 +91,14 @@ def test_a_part_may_be_hidden(model: ObjectModel, renderer: Renderer) -> None:
 def test_a_rough_mask_is_known_as_such(model: ObjectModel, renderer: Renderer) -> None:
     for view, _, near in cases(model, renderer):
         assert view.mask is not None
-        fit = fit_contour(view.with_mask(rough(view.mask)), model, near, renderer)
+        fit = fit_mask_edge(view.with_mask(rough(view.mask)), model, near, renderer)
         assert fit is None or not fit.exact
 
 
 def test_what_cannot_be_fitted(model: ObjectModel, renderer: Renderer) -> None:
     view, truth, _ = cases(model, renderer, 1)[0]
-    assert fit_contour(view.with_mask(np.zeros((480, 640), bool)), model, truth, renderer) is None
+    assert fit_mask_edge(view.with_mask(np.zeros((480, 640), bool)), model, truth, renderer) is None
     aside = Pose(truth.R, truth.t + [5.0, 0, 0])
-    assert fit_contour(view, model, aside, renderer) is None
+    assert fit_mask_edge(view, model, aside, renderer) is None
     with pytest.raises(ValueError, match="mask"):
-        fit_contour(view.with_mask(None), model, truth, renderer)
+        fit_mask_edge(view.with_mask(None), model, truth, renderer)

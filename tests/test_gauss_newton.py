@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from conftest import differences, moved
-from posekit.align.fusion import Belief, Lines, Points, fuse
-from posekit.align.mask_edge import ContourConfig, _equations, _Look
+from posekit.align.gauss_newton import GaussianPose, Lines, Points, fuse
+from posekit.align.mask_edge import MaskEdgeConfig, _Crop, _equations
 from posekit.camera import Camera
 from posekit.geometry import Pose, so3_exp, so3_log
 from posekit.nets.rigid import Motion, Surface, _step, exp_so3, induced_flow
@@ -67,7 +67,7 @@ def test_robust_weights_depend_on_the_size_alone(sign: float) -> None:
 
 def test_a_belief_pulls_towards_its_pose_and_turns_with_its_axes() -> None:
     step = np.array([0.02, -0.01, 0.03, 0.002, 0.003, -0.004])
-    belief = Belief.about(moved(POSE, step), CAMERA, 0.1, 5.0, 0.02)
+    belief = GaussianPose.about(moved(POSE, step), CAMERA, 0.1, 5.0, 0.02)
     np.testing.assert_allclose(np.diag(belief.covariance)[[0, 3, 5]],
                                [0.01, (5 / 640 * belief.pose.t[2]) ** 2, (0.02 * belief.pose.t[2]) ** 2])  # fmt: skip
     assert belief.turn_std == pytest.approx(0.1 * np.sqrt(3))
@@ -83,17 +83,17 @@ def test_a_belief_pulls_towards_its_pose_and_turns_with_its_axes() -> None:
 
 
 def test_fusing_leaves_no_point_behind_the_camera() -> None:
-    near = Belief.about(Pose(POSE.R, np.array([0.0, 0.0, 5e-4])), CAMERA, 0.1, 1.0, 0.1)
+    near = GaussianPose.about(Pose(POSE.R, np.array([0.0, 0.0, 5e-4])), CAMERA, 0.1, 1.0, 0.1)
     assert fuse(POSE, [near], CAMERA) is None
 
 
 def test_the_contours_equations_are_least_squares_with_a_prior() -> None:
     """The mask's distance is linear in the picture here, so that its change with the pose is known."""
-    config = ContourConfig(knee=FIRM)
+    config = MaskEdgeConfig(knee=FIRM)
     start = moved(POSE, np.array([0.01, 0.02, -0.01, 0.001, 0.0, 0.002]))
     place = CAMERA.project(POSE.apply(POINTS))
     distance = RNG.normal(size=30)
-    look = _Look(CAMERA, np.eye(3), Pose.identity(), POSE, POINTS, distance, NORMALS, np.ones(30, bool), 1.5)
+    look = _Crop(CAMERA, np.eye(3), POSE, POINTS, distance, NORMALS, np.ones(30, bool), 1.5)
     grown = 0.7
 
     def residual(step: np.ndarray) -> np.ndarray:
@@ -101,7 +101,7 @@ def test_the_contours_equations_are_least_squares_with_a_prior() -> None:
         return np.asarray(distance + moves - grown - step[6])
 
     J = differences(residual, 7)
-    weight = 1 / config.sigma**2 / (config.together * 1.5)
+    weight = 1 / config.sigma**2 / (config.correlated * 1.5)
     depth = POSE.t[2]
     sideways = config.shift / CAMERA.fx * depth
     prior = np.array([config.turn] * 3 + [sideways] * 2 + [config.depth * depth, config.grown]) ** -2.0
