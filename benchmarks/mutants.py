@@ -35,10 +35,11 @@ MODULES = {
     "camera": ["test_geometry", "test_zoom"],
     "zoom": ["test_geometry", "test_zoom"],
     "metrics": ["test_metrics"],
-    "pnp": ["test_pnp"],
-    "fusion": ["test_fusion"],
+    "align/gauss_newton": ["test_gauss_newton", "test_pnp"],
+    "align/pnp": ["test_pnp"],
+    "align/mask_edge": ["test_mask_edge", "test_gauss_newton"],
     "results": ["test_results"],
-    "data/bop": ["test_bop"],
+    "datasets/bop": ["test_bop"],
 }
 OPERATORS: dict[type, type] = {
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Mult,

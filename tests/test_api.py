@@ -97,7 +97,7 @@ def test_what_cannot_be_used_is_said(example: Example, estimator: PoseEstimator)
         estimate(example.view.image, estimator, example.box, camera=Camera.from_fov(1.0, 64, 48))
     nothing = Result(example.view, estimator, ())
     assert not nothing.reliable
-    with pytest.raises(PromptError, match="nothing in the picture"):
+    with pytest.raises(PromptError, match="not found: give a box"):
         _ = nothing.best
 
 

@@ -151,7 +151,7 @@ def test_estimate_writes_a_result_and_an_overlay(invoke: Invoke, tmp_path: Path)
 
 
 @pytest.mark.parametrize("command", ["estimate", "refine"])
-@pytest.mark.parametrize("least", [0.0, 2.0])
+@pytest.mark.parametrize("min_score", [0.0, 2.0])
 def test_what_is_not_reliable_says_so_first(
     invoke: Invoke, monkeypatch: pytest.MonkeyPatch, command: str, min_score: float
 ) -> None:
@@ -596,3 +596,10 @@ def test_interrupt_is_exit_code_130(folder: Path, tmp_path: Path) -> None:
     assert process.returncode in (130, -signal.SIGINT) and stdout == ""
     assert "Traceback" not in stderr or process.returncode < 0
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("old", "new"), [(["--least", "0.3"], "--min-score"), (["--no-contour"], "--no-mask-edge")])
+def test_an_options_former_name_works_with_a_notice(invoke: Invoke, old: list[str], new: str) -> None:
+    result = invoke("estimate", "missing.png", "--model", "missing.ply", *old)
+    assert f"{old[0]} is now called {new}" in result.stderr
+    assert result.exit_code == 1 and "missing.png" in result.stderr  # the option was taken

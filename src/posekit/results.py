@@ -192,7 +192,7 @@ def _estimate_to_dict(estimate: Estimate) -> dict[str, Any]:
         "reliable": estimate.reliable,
         "angle_deg": estimate.angle_deg,
         "iterations": estimate.iterations,
-        "contour_std_deg": None if estimate.mask_edge_std is None else math.degrees(estimate.mask_edge_std),
+        "mask_edge_std_deg": None if estimate.mask_edge_std is None else math.degrees(estimate.mask_edge_std),
         "converged": estimate.converged,
         "branch": None if estimate.branch is None else estimate.branch.value,
         "score": estimate.score,
@@ -221,7 +221,7 @@ def _estimate_from_dict(entry: Mapping[str, Any]) -> Estimate:
         and Detection(_box(found["box"]), None, _number(found["score"]), found["label"], Source(found["source"])),
         trace=tuple(Step(Pose.from_matrix(s["T_cam_obj"]), _radians(s["angle_deg"])) for s in entry["trace"]),
         timings={stage: _number(seconds) for stage, seconds in entry["timings_s"].items()},
-        mask_edge_std=None if entry.get("contour_std_deg") is None else _radians(entry["contour_std_deg"]),
+        mask_edge_std=None if entry.get("mask_edge_std_deg") is None else _radians(entry["mask_edge_std_deg"]),
         branch=None if entry.get("branch") is None else Branch(entry["branch"]),
         alternatives=tuple(_estimate_from_dict(other) for other in entry.get("alternatives", ())),
     )
