@@ -277,7 +277,8 @@ class VideoFrames:
 
     def _frame(self, number: int, image: Image, seconds: float | None) -> Frame:
         try:
-            return Frame(number, *self._cameras.seen(image), seconds=seconds)
+            seen, camera, valid = self._cameras.seen(image)
+            return Frame(number, seen, camera, valid, seconds)
         except InputError as error:  # the size changed to another shape
             return Frame(number, None, seconds=seconds, problem=f"frame {number}: {error}")
 
