@@ -26,9 +26,13 @@ LEAST_VIEWS = 3  # fewer do not determine a camera
 FEW_VIEWS = 8  # fewer are warned of
 LEAST_COVERAGE = 0.5  # of the picture
 LEAST_TILT_DEG = 20.0  # between the two views whose boards are turned most against each other
+FACING_DEG = 8.0  # boards turned less than so against each other and the camera do not determine the focal length
 MOST_FOCAL_STD = 0.1  # of the focal length; more is refused
 _WARNED_FOCAL_STD = 0.01
 _WARNED_RMS = 1 / 1500  # of the picture's longer side
+_KNOWN_STD = 3.0  # how many standard deviations a distortion coefficient must be away from 0
+_WORSE = 1.1  # times the error of a model with more coefficients
+_WIDEST = 4.0  # tangent of the angle to the optical axis up to which distortion is looked at
 _OUTLIER = 3.0  # times the median error of a picture
 _NO_OUTLIER_PX = 0.5
 _MOST_CANDIDATES = 300  # frames of a video in which the board is looked for
@@ -302,22 +306,44 @@ class _Solution:
 
 
 def _pinhole(views: Sequence[BoardView], board: Board) -> _Solution:
-    """k1, k2, p1, p2, and k3 where it is known better than its own size."""
+    """Of the models with k1, k2, p1, p2, k3; without k3; and with k1 and tangential distortion alone the first whose
+    last radial coefficient is known better than its own size, and which can be undone over the picture; but no simpler
+    one that fits worse. A coefficient beyond that would follow noise where no corner was seen."""
     points, pixels = _lists(views, board, np.float32)
-    found = _solved(points, pixels, views[0].size, 0)
-    k3, k3_std = found[2].ravel()[4], found[5].ravel()[8]
-    if abs(k3) < 2 * k3_std:
-        found = _solved(points, pixels, views[0].size, cv2.CALIB_FIX_K3)
-        coefficients = found[2].ravel()[:4]
-    else:
-        coefficients = found[2].ravel()[:5]
-    _, K, _, turns, shifts, std = found[:6]
+    size, solved, count = views[0].size, None, 5
+    for flags, last, more in ((0, 4, 5), (cv2.CALIB_FIX_K3, 1, 4), (cv2.CALIB_FIX_K3 | cv2.CALIB_FIX_K2, 0, 4)):
+        tried = _solved(points, pixels, size, flags)
+        if solved is not None and tried[0] > _WORSE * solved[0] + 0.01:
+            break
+        solved, count = tried, more
+        coefficients, std = solved[2].ravel(), solved[5].ravel()
+        known = abs(coefficients[last]) >= _KNOWN_STD * std[4 + last]
+        if known and _undoable(solved[1], coefficients[:count], size):
+            break
+    assert solved is not None
+    _, K, D, turns, shifts, std, *_ = solved
+    coefficients, std = D.ravel()[:count], std.ravel()
     residuals = [
         cv2.projectPoints(p, r, t, K, coefficients)[0].reshape(-1, 2) - x.reshape(-1, 2)
         for p, x, r, t in zip(points, pixels, turns, shifts, strict=True)
     ]
-    fx, fy, cx, cy = (float(value) for value in std.ravel()[:4])
+    fx, fy, cx, cy = (float(value) for value in std[:4])
     return _Solution(K, coefficients, _matrices(turns), _vectors(shifts), residuals, (fx, fy, cx, cy))
+
+
+def _undoable(K: Array, coefficients: Array, size: tuple[int, int]) -> bool:
+    """Whether radial distortion grows steadily up to the picture's corners, and moves them at most by half or twice."""
+    k1, k2, k3 = (*coefficients[:2], *coefficients[4:5], 0.0)[:3]
+    r = np.linspace(0.0, _WIDEST, 4000)
+    bent = r * (1 + r**2 * (k1 + r**2 * (k2 + r**2 * k3)))
+    steady = np.maximum.accumulate(bent) == bent
+    end = len(r) if steady.all() else int(np.argmin(steady))
+    edges = np.array([(u, v) for u in (0, size[0] - 1) for v in (0, size[1] - 1)])
+    corner = np.linalg.norm((edges - K[:2, 2]) / np.diag(K)[:2], axis=1).max()
+    if bent[end - 1] < corner:
+        return False
+    undone = float(np.interp(corner, bent[:end], r[:end]))
+    return bool(0.5 * corner < undone < 2 * corner)
 
 
 def _solved(points: list[Any], pixels: list[Any], size: tuple[int, int], flags: int) -> Any:
@@ -329,7 +355,7 @@ def _solved(points: list[Any], pixels: list[Any], size: tuple[int, int], flags: 
 
 
 def _fisheye(views: Sequence[BoardView], board: Board) -> _Solution:
-    points, pixels = _lists(views, board, np.float64)
+    points, pixels = _lists(views, board, np.float64, (1, -1))  # as its check of shapes wants them
     flags = sum(
         getattr(cv2.fisheye, name, getattr(cv2, name, 0)) for name in ("CALIB_RECOMPUTE_EXTRINSIC", "CALIB_FIX_SKEW")
     )  # OpenCV 4 and 5 keep them in different places
@@ -354,10 +380,13 @@ def _unsolved(error: Exception) -> str:
     )
 
 
-def _lists(views: Sequence[BoardView], board: Board, kind: type) -> tuple[list[Any], list[Any]]:
+def _lists(
+    views: Sequence[BoardView], board: Board, kind: type, shape: tuple[int, int] = (-1, 1)
+) -> tuple[list[Any], list[Any]]:
+    """Points (metres) and pixels of each view, (N, 1, 3) and (N, 1, 2), or of another such ``shape``."""
     corners = board.corners
-    points: list[Any] = [corners[view.corners].reshape(-1, 1, 3).astype(kind) for view in views]
-    return points, [view.pixels.reshape(-1, 1, 2).astype(kind) for view in views]
+    points: list[Any] = [corners[view.corners].reshape(*shape, 3).astype(kind) for view in views]
+    return points, [view.pixels.reshape(*shape, 2).astype(kind) for view in views]
 
 
 def _matrices(turns: Sequence[Any]) -> list[Array]:
@@ -395,9 +424,17 @@ def _result(
             f"the distortion that fits these {len(views)} views ({', '.join(f'{v:.3g}' for v in coefficients)}) cannot "
             f"be undone up to the picture's edge: {advice}, above all in its corners."
         ) from error
+    tilt = _largest_angle_deg([turn[:, 2] for turn in found.turns])
+    if (
+        tilt < FACING_DEG
+        and _largest_angle_deg([np.array([0.0, 0.0, 1.0]), *(R[:, 2] for R in found.turns)]) < FACING_DEG
+    ):
+        raise CameraError(
+            f"all boards face the camera (turned by {tilt:.0f} degrees at most): near with a short focal length looks "
+            f"like far with a long one. So {advice}."
+        )
     rms = _rms(np.concatenate(found.residuals))
     covered, missing = _coverage(views)
-    tilt = _largest_angle_deg([turn[:, 2] for turn in found.turns])
     middle = config.board.corners.mean(axis=0)
     distances = [float(np.linalg.norm(R @ middle + t)) for R, t in zip(found.turns, found.shifts, strict=True)]
     warnings = _warnings(len(views), covered, missing, tilt, rms, doubt, size, config)
