@@ -368,7 +368,7 @@ def test_a_tall_board_lies_on_a_tall_page() -> None:
 
 
 def read_page(pdf: bytes) -> tuple[Image.Image, tuple[float, float]]:
-    """The one picture of a PDF and its page's size in millimetres."""
+    """The one picture of a PDF, its strip in a TIFF's header, and the page's size in millimetres."""
     box = re.search(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", pdf)
     assert box is not None and b"/CCITTFaxDecode" in pdf and b"/BlackIs1 true" in pdf
     drawn = re.search(rb"q ([\d.]+) 0 0 ([\d.]+) 0 0 cm /image Do", pdf)
@@ -381,14 +381,13 @@ def read_page(pdf: bytes) -> tuple[Image.Image, tuple[float, float]]:
         (257, size[1]),
         (258, 1),
         (259, 4),
-        (262, 0),
+        (262, 1),
         (273, 134),
         (278, size[1]),
         (279, len(data)),
     ]
-    head = (
-        b"II*\0" + struct.pack("<IH", 8, len(entries)) + b"".join(struct.pack("<HHII", t, 4, 1, v) for t, v in entries)
-    )
+    fields = [struct.pack("<HHII", tag, 4 if value > 65535 else 3, 1, value) for tag, value in entries]
+    head = b"II*\0" + struct.pack("<IH", 8, len(entries)) + b"".join(fields)
     page = Image.open(BytesIO(head.ljust(134, b"\0") + data))
     page.load()
     return page, tuple(float(v) / 72 * 25.4 for v in box.groups())  # type: ignore[return-value]
