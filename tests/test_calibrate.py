@@ -172,6 +172,19 @@ def test_corners_are_where_the_camera_says() -> None:
     assert np.abs(errors.mean(axis=0)).max() < 0.05, "no offset by half a pixel"
 
 
+def test_corners_of_a_large_chessboard_are_where_they_are() -> None:
+    board, side = Board.chosen("chessboard"), 60
+    H = np.array([[3.1, 0.4, 150.0], [-0.3, 3.3, 420.0], [1e-4, 2e-4, 1.0]])
+    sheet = np.pad(board.picture(side), side, constant_values=255)
+    shown = cv2.warpPerspective(sheet, H, (2200, 1700), flags=cv2.INTER_LINEAR, borderValue=120)
+    found = board.found(np.repeat(cv2.GaussianBlur(shown, (0, 0), 1.2)[..., None], 3, axis=2))
+    assert not isinstance(found, str)
+    place = (board.corners[:, :2] / 0.025 + 1) * side - 0.5
+    wanted = cv2.perspectiveTransform(place[:, None], H)[:, 0]
+    errors = min((found[1] - wanted, found[1][::-1] - wanted), key=lambda off: np.abs(off).max())
+    assert np.abs(errors).max() < 0.15 and np.abs(errors.mean(axis=0)).max() < 0.03
+
+
 def test_fisheye() -> None:
     found = calibrate_views(exact(FISHEYE, _near(poses(24, spread=1.6), 0.15), 0.05), CalibrationConfig(fisheye=True))
     assert found.model == "fisheye" and found.std_px is None
@@ -304,7 +317,7 @@ def test_the_command(folder: Path, tmp_path: Path) -> None:
         (("FOLDER", "--squares", "20x20"), "has 200 markers, the dictionary 5X5_50 only 50"),
         (("FOLDER", "--pattern", "chessboard", "--marker-mm", "3"), "a chessboard has no markers"),
         (("FOLDER", "--dictionary", "DICT_4X4_50"), "Some show markers of the dictionary 5X5_50: pass --dict"),
-        (("FOLDER/photo_0.png",), "is seen in 1 usable pictures, at least 3 are needed. Check --pattern"),
+        (("FOLDER/photo_0.png",), "is seen in 1 usable picture, at least 3 are needed. Check --pattern"),
         (("--board-pdf", "board.png"), "--board-pdf board.png: name a file that ends in .pdf"),
         (("--board-pdf", "b.pdf", "--square-mm", "60"), "do not fit on A4 paper: squares of 36.5 mm do"),
     ],
@@ -391,6 +404,32 @@ def read_page(pdf: bytes) -> tuple[Image.Image, tuple[float, float]]:
     page = Image.open(BytesIO(head.ljust(134, b"\0") + data))
     page.load()
     return page, tuple(float(v) / 72 * 25.4 for v in box.groups())  # type: ignore[return-value]
+
+
+# --- the docs ---------------------------------------------------------------------------------------------------
+
+
+def test_what_the_docs_say_can_be_run(
+    folder: Path, photos: list[Photo], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (Path(__file__).parent.parent / "docs/calibration.md").read_text()
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "photos").symlink_to(folder)
+    save(tmp_path / "chess", [photograph(PINHOLE, *pose, Board.chosen("chessboard")) for pose in poses(4, spread=0.4)])
+    with VideoWriter(tmp_path / "clip.mp4", 4, quality=10) as writer:
+        for photo in photos:
+            writer.write(photo)
+    lines = re.findall(r"^    posekit calibrate (.+)$", text, re.MULTILINE)
+    assert len(lines) == 6
+    for line in lines:
+        assert (result := run(*line.split())).exit_code == 0, result.output
+    names = ("board.pdf", "board-letter.pdf", "chessboard.pdf", "camera.json", "phone.json", "chess.json")
+    assert all((tmp_path / name).stat().st_size for name in names)
+    block = re.search(r"```python\n(.+?)```", text, re.DOTALL)
+    assert block is not None
+    (tmp_path / "camera.json").unlink()
+    exec(block.group(1), {})
+    assert load_calibration("camera.json", CAMERA.size).lens is not None
 
 
 def test_config_errors_are_of_their_kind() -> None:

@@ -242,7 +242,8 @@ class Board:
             seen = 0 if markers is None else len(markers)
             if not seen:
                 return f"no marker of the dictionary {self._name} is seen"
-            return f"{seen} markers are seen, but no corner of a board of {self.columns}x{self.rows} squares"
+            counted = "only 1 marker is seen, and" if seen == 1 else f"{seen} markers are seen, but"
+            return f"{counted} no corner of a board of {self.columns}x{self.rows} squares"
         if count < self.least_corners:
             return f"only {count} corners of the board are seen, {self.least_corners} are needed"
         if self._charuco.checkCharucoCornersCollinear(ids):

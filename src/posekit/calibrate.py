@@ -287,7 +287,8 @@ def _too_few(count: int, left_out: dict[str, str], hint: str, board: Board) -> s
         else "Check --pattern and --squares (columns x rows of squares, not inner corners), and take sharp pictures of "
         "the board from different sides, near enough to fill half of the picture."
     )
-    return f"the board ({board}) is seen in {count} usable pictures, at least {LEAST_VIEWS} are needed{why}. {help_}"
+    usable = "1 usable picture" if count == 1 else f"{count} usable pictures"
+    return f"the board ({board}) is seen in {usable}, at least {LEAST_VIEWS} are needed{why}. {help_}"
 
 
 # --- from corners to a camera -----------------------------------------------------------------------------------

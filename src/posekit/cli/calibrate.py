@@ -21,7 +21,7 @@ _MOST_TOLD = 12  # pictures that were left out
 def calibrate(
     sources: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[IMAGES|FOLDER|VIDEO]...", help="What shows the board, at least 8 times."),
+        typer.Argument(metavar="IMAGES|FOLDER|VIDEO", help="What shows the board, at least 8 times."),
     ] = None,
     pattern: Annotated[Literal["charuco", "chessboard"], typer.Option(help="Of the board.", rich_help_panel=BOARD)] = (
         "charuco"
