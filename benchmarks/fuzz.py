@@ -354,7 +354,7 @@ def configurations() -> list[Case]:
 
 
 def weights() -> list[Case]:
-    from posekit.nets.lite import LiteConfig
+    from posekit.nets.config import LiteConfig
     from posekit.nets.weights import build, save_networks
 
     small = LiteConfig(widths=(8, 16), blocks=1, bottleneck=8, fine=8)

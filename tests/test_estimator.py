@@ -18,8 +18,9 @@ from posekit.geometry import Pose, rotation_angle, so3_exp, view_rotation
 from posekit.mesh.model import ObjectModel
 from posekit.mesh.symmetries import Symmetries
 from posekit.metrics import pose_error
+from posekit.nets.config import PaperConfig
 from posekit.nets.paper import PaperSVNet
-from posekit.nets.weights import Networks, PaperConfig, build, save_networks
+from posekit.nets.weights import Networks, build, save_networks
 from posekit.render import Renderer
 from posekit.results import Branch, Detection, Estimate, Source
 from posekit.tracking.tracker import LOST, RESTARTED, Tracker

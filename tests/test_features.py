@@ -12,8 +12,8 @@ import pytest
 from objects import bracket, cuboid
 from posekit.camera import Camera
 from posekit.detect.novel import make_detector
-from posekit.first_pose import features
-from posekit.first_pose.features import FeatureModel, FeatureSearch, cache_file
+from posekit.first_pose import features, mesh_cache
+from posekit.first_pose.features import VERSION, FeatureModel, FeatureSearch
 from posekit.geometry import Pose, random_rotation, rotation_angle
 from posekit.mesh.model import ObjectModel
 from posekit.render import Light, Renderer
@@ -161,9 +161,9 @@ def test_another_texture_has_another_file_and_a_damaged_one_is_made_anew(
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     model = textured()
-    path = cache_file(model)
-    assert path != cache_file(textured(1))
-    assert cache_file(model) == cache_file(textured())
+    path = mesh_cache.cache_file("features", model, VERSION)
+    assert path != mesh_cache.cache_file("features", textured(1), VERSION)
+    assert mesh_cache.cache_file("features", model, VERSION) == mesh_cache.cache_file("features", textured(), VERSION)
     assert tmp_path in path.parents
     path.parent.mkdir(parents=True)
     path.write_bytes(b"no archive")
@@ -173,11 +173,14 @@ def test_another_texture_has_another_file_and_a_damaged_one_is_made_anew(
 
 def test_the_oldest_files_make_room(renderer: Renderer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(features, "KEPT", 2)
+    monkeypatch.setattr(mesh_cache, "KEPT", 2)
     for seed in range(3):
         FeatureModel.of(textured(seed), renderer)
-    left = set(cache_file(textured()).parent.glob("*.npz"))
-    assert left == {cache_file(textured(1)), cache_file(textured(2))}
+    left = set(mesh_cache.cache_file("features", textured(), VERSION).parent.glob("*.npz"))
+    assert left == {
+        mesh_cache.cache_file("features", textured(1), VERSION),
+        mesh_cache.cache_file("features", textured(2), VERSION),
+    }
 
 
 def test_coloured_vertices_alone_give_nothing_false(renderer: Renderer) -> None:

@@ -92,7 +92,8 @@ def _openvino() -> list[Finding]:
 
 def _weights() -> list[Finding]:
     try:
-        from posekit.nets.weights import PRESETS, find_weights, load_networks
+        from posekit.nets.config import PRESETS, find_weights
+        from posekit.nets.weights import load_networks
     except (ImportError, OSError):
         return []  # torch's own finding says why
     found = []

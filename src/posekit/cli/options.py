@@ -114,16 +114,17 @@ DeviceOption = Annotated[
     typer.Option(help="What the networks run on; auto takes a GPU where there is one.", rich_help_panel=LOOP),
 ]
 ThreadsOption = Annotated[
-    int | None, typer.Option(min=1, help="Threads of torch; by default its own choice.", rich_help_panel=LOOP)
+    int | None,
+    typer.Option(min=1, help="Threads that the networks use; by default all.", rich_help_panel=LOOP),
 ]
 
 
 def use_threads(count: int | None) -> None:
-    """Let torch use so many threads from now on in this process; its own choice where none is given."""
+    """Let the networks use so many threads from now on in this process; their own choice where none is given."""
     if count is not None:
-        import torch
+        from posekit.nets import precision
 
-        torch.set_num_threads(count)
+        precision.use_threads(count)
 
 
 FormatOption = Annotated[

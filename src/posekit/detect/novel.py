@@ -8,7 +8,6 @@ docs/decisions tells what each is worth.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,6 +24,7 @@ from posekit.detect import Detector
 from posekit.detect.backbones import LITE0_MEAN, LITE0_STD, Lite0, lite0_imagenet, load_lite0
 from posekit.detect.maskrcnn import COCO, DOUBTFUL, SHIPPED, MaskRCNN, TrainedDetector, find, load_coco, load_detector
 from posekit.detect.sharpen import sharpened
+from posekit.detect.similarity import with_similarity
 from posekit.detect.vision import torchvision
 from posekit.errors import ConfigError
 from posekit.first_pose.features import FeatureSearch
@@ -42,7 +42,6 @@ ANY = "novel"  # the name of the shipped detector
 SIDE = 96  # pixels of the pictures whose features are compared
 LEVELS = {"2": 16, "3": 32}  # of the features, and their strides
 MARGIN = 1.1
-WEIGHT, USUAL = 20.0, 0.56  # of an object's similarity, and the one that says nothing: docs/decisions/0015
 
 
 @dataclass(frozen=True)
@@ -260,16 +259,6 @@ class SimilarityDetector:
             if each.score >= self.min_score and left[each.label] >= 0:
                 kept.append(each)
         return kept
-
-
-def with_similarity(chance: float, similarity: float) -> float:
-    """A chance that also says how much a thing looks like the mesh: docs/decisions/0015."""
-    return shifted(chance, WEIGHT * (similarity - USUAL))
-
-
-def shifted(chance: float, shift: float) -> float:
-    """A chance whose log odds are shifted; 0 and 1 stay."""
-    return chance if not 0 < chance < 1 else 1 / (1 + (1 / chance - 1) * math.exp(-shift))
 
 
 def _chroma(pictures: Sequence[View]) -> FArray:

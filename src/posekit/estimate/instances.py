@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from posekit.camera import box_overlap
-from posekit.detect.novel import USUAL, WEIGHT, shifted
+from posekit.detect.similarity import USUAL, WEIGHT, shifted
 from posekit.errors import ConfigError
 from posekit.mesh.model import ObjectModel
 from posekit.results import Detection, Estimate, Source

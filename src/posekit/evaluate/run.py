@@ -28,7 +28,7 @@ from posekit.evaluate.vsd import VsdMeter
 from posekit.evaluate.workers import run_pictures
 from posekit.geometry import Pose
 from posekit.io.files import check_writable, write_text_atomic
-from posekit.nets.weights import load_networks
+from posekit.nets.config import WeightsFile
 
 log = logging.getLogger("posekit")
 
@@ -67,7 +67,7 @@ def evaluate(
     if not wanted:
         raise ConfigError(f"no picture of {info.title} is left: check --images and the test's targets.")
     _check_objects(data, options)
-    weights = None if options.stage == "score" else load_networks(options.preset, options.weights)
+    weights = None if options.stage == "score" else WeightsFile.read(options.preset, options.weights)
     about = weights.about if weights is not None else {}
     source = table.Provenance(
         command,

@@ -7,10 +7,6 @@ says beside its place, the keypoint's size and turn, decides whether it bears a 
 
 from __future__ import annotations
 
-import hashlib
-import io
-import zipfile
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from weakref import WeakKeyDictionary
@@ -21,9 +17,8 @@ from numpy.typing import NDArray
 
 from posekit.align.pnp import PnpConfig, solve_pnp
 from posekit.camera import Box, Camera
-from posekit.errors import OutputError
+from posekit.first_pose.mesh_cache import cache_file, keep_arrays, read_arrays
 from posekit.geometry import Pose, cube_views
-from posekit.io.files import user_cache, write_bytes_atomic
 from posekit.mesh.model import ObjectModel
 from posekit.render import Light, Renderer, centred_poses, view_rotations
 from posekit.view import View
@@ -33,7 +28,6 @@ FArray = NDArray[np.float32]
 
 
 VERSION = 1  # of what is kept on disk; a change of the views or of the extraction raises it
-KEPT = 100  # meshes whose features stay on disk
 SIDE = 256  # pixels of a rendered view
 FIELD = float(np.deg2rad(30.0))  # of a rendered view
 OF_VIEW, OF_PICTURE = 400, 8000  # keypoints at most, the strongest
@@ -92,13 +86,14 @@ class FeatureModel:
         if model.texture is None and model.colors is None:
             none = np.zeros((0, 3))
             return cls(np.zeros((0, 128), np.float32), none, none, none, True)
-        kept = cache_file(model)
-        with suppress(OSError, ValueError, KeyError, zipfile.BadZipFile):  # not there yet, or damaged: made anew
-            return _read(kept)
-        made = _extracted(model, renderer)
-        with suppress(OSError, OutputError):  # a cache that cannot be written costs time only
-            _keep(kept, made)
-        return _decoded(*made)
+        file = cache_file("features", model, VERSION)
+        kept = _read(file)
+        if kept is not None:
+            return kept
+        raw, points, tips, directions, plain = _extracted(model, renderer)
+        arrays = {"raw": raw, "points": points, "tips": tips, "directions": directions}
+        keep_arrays(file, {**arrays, "plain": np.asarray(plain)})
+        return _decoded(raw, points, tips, directions, plain)
 
 
 @dataclass(frozen=True, eq=False)
@@ -400,32 +395,14 @@ def _decoded(raw: NDArray[np.uint8], points: Array, tips: Array, directions: Arr
     return FeatureModel(_root(raw), points, tips, directions, plain)
 
 
-def cache_file(model: ObjectModel) -> Path:
-    """Where a mesh's features are kept: named by its shape, its colours or texture, and this module's version."""
-    look = hashlib.sha256(model.digest.encode())
-    for array in (model.colors, model.uvs, model.texture):
-        if array is not None:
-            look.update(str(array.shape).encode() + np.ascontiguousarray(array).tobytes())
-    return user_cache("features") / f"{model.digest}-{look.hexdigest()[:16]}-{VERSION}.npz"
-
-
-def _keep(path: Path, made: _Made) -> None:
-    """Written whole or not at all; the oldest files make room."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    raw, points, tips, directions, plain = made
-    buffer = io.BytesIO()
-    np.savez(buffer, raw=raw, points=points, tips=tips, directions=directions, plain=plain)
-    write_bytes_atomic(path, buffer.getvalue())
-    files = sorted(path.parent.glob("*.npz"), key=lambda p: p.stat().st_mtime)
-    for old in files[:-KEPT]:
-        old.unlink(missing_ok=True)
-
-
-def _read(path: Path) -> FeatureModel:
-    """Raises OSError, ValueError, KeyError or BadZipFile where there is none that can be used."""
-    with np.load(path, allow_pickle=False) as kept:
-        made = _decoded(kept["raw"], kept["points"], kept["tips"], kept["directions"], bool(kept["plain"]))
+def _read(path: Path) -> FeatureModel | None:
+    """None where there is none that can be used."""
+    kept = read_arrays(path)
+    if kept is None or set(kept) != {"raw", "points", "tips", "directions", "plain"}:
+        return None
+    made = _decoded(kept["raw"], kept["points"], kept["tips"], kept["directions"], bool(kept["plain"]))
     n = len(made.points)
-    if made.descriptors.shape != (n, 128) or {made.points.shape, made.tips.shape, made.directions.shape} != {(n, 3)}:
-        raise ValueError(f"{path} holds other arrays than features")
-    return made
+    fits = made.descriptors.shape == (n, 128) and {made.points.shape, made.tips.shape, made.directions.shape} == {
+        (n, 3)
+    }
+    return made if fits else None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -13,16 +12,19 @@ from numpy.typing import NDArray
 
 from posekit.align.pnp import PnpConfig, solve_pnp
 from posekit.camera import Camera, Zoom
-from posekit.first_pose.hypotheses import Hypothesis, MVNetSearch
+from posekit.errors import WeightsError
+from posekit.first_pose.hypotheses import FirstPoseSearch, Hypothesis, box_mask
 from posekit.first_pose.view_bank import DISTANCE, TURNS, ViewBank
-from posekit.geometry import Pose, rotation_angle, rotation_between, so3_exp
+from posekit.geometry import Pose, cube_views, quat_to_rotation, rotation_angle, rotation_between, so3_exp
 from posekit.mesh.model import ObjectModel
+from posekit.nets.inputs import to_input
 from posekit.nets.mvnet import CELL, GRID, NONE, VIEW, Encoded, Matches, MatchingMVNet, rgb_input, view_input
+from posekit.nets.pose_delta import PoseDelta, apply_delta
 from posekit.nets.weights import Networks
 from posekit.render import Renderer
 from posekit.results import Detection
 from posekit.view import View
-from posekit.zoom import zoom_to_box
+from posekit.zoom import frontal_camera, frontal_pose, zoom_to_box
 
 Array = NDArray[np.float64]
 FArray = NDArray[np.float32]
@@ -40,14 +42,6 @@ class MatchingOptions:
     pooled: int = 3  # best views whose correspondences are also solved together
     apart: float = float(np.deg2rad(15.0))  # least angle between two hypotheses
     refine: PnpConfig = PnpConfig(iterations=8, min_points=6)  # the last solve
-
-
-class FirstPoseSearch(Protocol):
-    """Whatever gives first poses for a detection."""
-
-    def search(self, view: View, detection: Detection, count: int) -> list[Hypothesis]:
-        """At most ``count`` ``T_cam_obj``, best first."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +93,47 @@ def mvnet_search(model: ObjectModel, networks: Networks, renderer: Renderer) -> 
     if isinstance(networks.mvnet, MatchingMVNet):
         return MatchingSearch(model, networks.mvnet, renderer)
     return MVNetSearch(model, networks, renderer)
+
+
+class MVNetSearch:
+    """The paper's first pose: MV-Net compares the crop with the six views of a cube's faces (section 3.2).
+
+    The views are rendered once per mesh, each as a crop round its own box would show it. The answer is relative to
+    the frontal view, placed at the detection box's centre, at the depth at which it looks as large in the crop as it
+    was rendered: so the box's size gives the first depth.
+    """
+
+    def __init__(self, model: ObjectModel, networks: Networks, renderer: Renderer) -> None:
+        if networks.mvnet is None:
+            raise WeightsError(
+                f"the {networks.preset} weights {networks.digest} hold no trained MV-Net: use --init templates."
+            )
+        self.model, self.size, self.mvnet = model, networks.size, networks.mvnet
+        self.rotations = cube_views()
+        self.camera, self.distance = frontal_camera(model, networks.size)
+        poses = [Pose(R, np.array([0, 0, self.distance])) @ model.T_ctr_obj for R in self.rotations]
+        views = renderer.render(model, poses, self.camera, coords=False)
+        self.device = networks.device
+        self.views = torch.from_numpy(np.stack([to_input(v.image, v.mask) for v in views])).to(self.device)
+
+    def search(self, view: View, detection: Detection, count: int) -> list[Hypothesis]:
+        """One first pose; ``count`` is an upper bound, as for every search. Empty where it lies behind the camera."""
+        mask = detection.mask if detection.mask is not None else box_mask(detection.box, view.camera)
+        crop = view.with_mask(mask).zoomed(zoom_to_box(view.camera, detection.box, self.size))
+        observed = torch.from_numpy(to_input(crop.image, crop.mask))[None].to(self.device)
+        with torch.inference_mode():
+            out = self.mvnet(observed, self.views[None])
+        quat_wxyz, v = (x[0].double().cpu().numpy() for x in (out.quat_wxyz, out.v))
+        delta = PoseDelta(quat_to_rotation(quat_wxyz), v)
+        target = apply_delta(self.frontal(crop.camera), delta, crop.camera.fx)
+        if not np.isfinite(target.matrix).all() or target.t[2] < 0.6 * self.model.diameter:
+            return []
+        T_cam_view = Pose.rotation(crop.R_view_cam.T)
+        return [Hypothesis(T_cam_view @ target @ self.model.T_ctr_obj, 1.0)][:count]
+
+    def frontal(self, crop_camera: Camera) -> Pose:
+        """The ``T_view_ctr`` to which MV-Net's answer is relative."""
+        return frontal_pose(self.camera, self.distance, crop_camera)
 
 
 class MatchingSearch:

@@ -18,30 +18,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from posekit.nets.config import CELL, LiteConfig
 from posekit.nets.heads import PoseHeads, Prediction, expand_angle
 from posekit.nets.rigid import Motion, Surface, induced_flow, solve_motion
 
-CELL = 8  # pixels per cell
 ANCHOR = 4  # pixels per anchor of the dense head; the first anchor is pixel (2, 2)
 FACTS = 9  # see `facts_of`
 PAIR = 11  # channels that the tower over both crops sees: two RGB pictures, mask, normals, relief
-
-
-@dataclass(frozen=True)
-class LiteConfig:
-    """The size of the lite network."""
-
-    size: tuple[int, int] = (128, 96)  # (width, height) of the crop in pixels, multiples of 8
-    widths: tuple[int, int] = (64, 192)  # channels at 1/4 and 1/8
-    heads: int = 1  # of the attention across
-    blocks: int = 6  # exchanges
-    bottleneck: int = 96  # channels of their 3x3 convolutions
-    fine: int = 48  # channels of the dense head
-
-    @property
-    def cells(self) -> tuple[int, int]:
-        """(rows, columns) at 1/8."""
-        return self.size[1] // CELL, self.size[0] // CELL
 
 
 def conv_bn(cin: int, cout: int, kernel: int = 3, stride: int = 1) -> nn.Sequential:

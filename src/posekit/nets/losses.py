@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from posekit.nets.config import CELL
 from posekit.nets.heads import PoseHeads, Prediction, compress_angle
-from posekit.nets.lite import CELL, LiteOutput
+from posekit.nets.lite import LiteOutput
 
 
 def paper_pose_loss(prediction: Prediction, heads: PoseHeads, quat_wxyz: Tensor, v: Tensor) -> Tensor:

@@ -400,11 +400,9 @@ def _about(pose: Pose, camera: Camera, spread: tuple[float, float, float]) -> Ga
 
 
 def _predictor(estimator: PoseEstimator, config: TrackConfig) -> Predictor:
-    if config.runtime == "torch" or estimator.predictor.device.type != "cpu":
+    if config.runtime == "torch" or estimator.runtime.runtime == "torch":
         return estimator.predictor
-    from posekit.nets.openvino import OpenVinoPredictor
-
-    return OpenVinoPredictor(estimator.networks, threads=max(1, usable_cores() // 2))  # the rest works beside it
+    return estimator.runtime.predictor_for(1, max(1, usable_cores() // 2))  # the rest works beside it
 
 
 def _before_camera(points: NDArray[np.float64]) -> NDArray[np.float64]:

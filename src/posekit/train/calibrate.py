@@ -20,7 +20,7 @@ from posekit.errors import TrainingError
 from posekit.estimate.refine import compare, update_pose
 from posekit.geometry import Pose, random_rotation, rotation_angle
 from posekit.nets.heads import compress_angle
-from posekit.nets.predictor import NetworkPredictor
+from posekit.nets.pytorch import NetworkPredictor
 from posekit.nets.weights import Networks
 from posekit.render import Renderer
 from posekit.train.measure import Case

@@ -13,9 +13,8 @@ from typing import Any, TypeVar
 import tomli_w
 
 from posekit.errors import ConfigError
-from posekit.nets.lite import LiteConfig
+from posekit.nets.config import LiteConfig, PaperConfig
 from posekit.nets.losses import DenseLossConfig
-from posekit.nets.weights import PaperConfig
 from posekit.train.data.stream import StreamConfig
 
 RECIPES = ("lite", "paper")

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from posekit.datasets.bop import BopDataset
 from posekit.estimate.refine import RefineOptions, refine
-from posekit.first_pose.mvnet import FirstPoseSearch, mvnet_search
+from posekit.first_pose.hypotheses import FirstPoseSearch
+from posekit.first_pose.mvnet import mvnet_search
 from posekit.geometry import Pose
 from posekit.mesh.model import ObjectModel
 from posekit.metrics import add, pose_error, within
-from posekit.nets.predictor import NetworkPredictor
+from posekit.nets.pytorch import NetworkPredictor
 from posekit.nets.weights import Networks
 from posekit.render import Renderer
 from posekit.results import Detection, Source

@@ -16,7 +16,8 @@ from torch import Tensor
 from posekit._version import __version__
 from posekit.errors import ConfigError, OutputError, WeightsError
 from posekit.io.files import write_text_atomic
-from posekit.nets.lite import LiteConfig, LiteSVNet
+from posekit.nets.config import LiteConfig
+from posekit.nets.lite import LiteSVNet
 from posekit.nets.mvnet import MatchingMVNet
 from posekit.nets.weights import Networks, build, load_networks, save_networks
 from posekit.render import Renderer
