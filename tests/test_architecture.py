@@ -16,7 +16,20 @@ SOURCE = Path(__file__).resolve().parent.parent / "src" / "posekit"
 LAYERS = {
     0: {"geometry", "camera", "files", "lens", "polygons", "pixels", "mesh_files", "gltf_files", "limits"},
     1: {"view", "object_model", "results", "pose_formats"},
-    2: {"load", "calibration", "zoom", "metrics", "pnp", "fusion", "render", "nets", "detect", "draw", "evidence"},
+    2: {
+        "load",
+        "calibration",
+        "zoom",
+        "metrics",
+        "pnp",
+        "fusion",
+        "render",
+        "nets",
+        "detect",
+        "draw",
+        "evidence",
+        "mesh_export",
+    },
     3: {
         "data",
         "refine",
@@ -31,7 +44,7 @@ LAYERS = {
         "mvnet_search",
         "features",
     },
-    4: {"estimate", "novel"},
+    4: {"estimate", "novel", "viewer"},
     5: {"search", "track", "evaluate", "train"},
     6: {"api"},
     7: {"cli"},
@@ -62,7 +75,7 @@ SIBLINGS |= {("data", "view_bank"), ("mvnet_search", "view_bank"), ("mvnet_searc
 DOORS = {
     "moderngl": {"render"},
     "glcontext": {"render"},
-    "trimesh": {"object_model"},
+    "trimesh": {"object_model", "mesh_export"},
     "mapbox_earcut": {"polygons"},
     "yaml": {"calibration"},
     "torchvision": {"detect", "train"},
@@ -73,6 +86,7 @@ DOORS = {
     "pycocotools": {"detect"},
     "av": {"video"},
     "rerun": {"recording"},
+    "viser": {"viewer"},
     "openvino": {"nets", "cli"},
 }
 

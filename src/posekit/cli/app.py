@@ -19,7 +19,7 @@ import typer
 from typer.core import TyperGroup
 
 from posekit._version import __version__
-from posekit.cli import demo, detect, doctor, download, estimate, eval, refine, render_views, synth, track, train
+from posekit.cli import demo, detect, doctor, download, estimate, eval, refine, render_views, synth, track, train, view
 from posekit.errors import PosekitError
 
 INTERRUPTED = 130  # as shells count it: 128 + SIGINT
@@ -120,6 +120,7 @@ app.command("estimate")(estimate.estimate)
 app.command("detect")(detect.detect)
 app.command("refine")(refine.refine)
 app.command("track")(track.track)
+app.command("view")(view.view)
 app.command("render-views")(render_views.render_views)
 app.command("synth")(synth.synth)
 app.add_typer(train.train, name="train")
