@@ -27,6 +27,7 @@ def to_glb(model: ObjectModel, opacity: float = 1.0, texture_side: int = TEXTURE
         metallicFactor=0.0,
         roughnessFactor=1.0,
         alphaMode="OPAQUE" if opacity >= 1 else "BLEND",
+        doubleSided=True,  # as the renderer draws: nobody vouches for the order of a face's corners
     )
     if model.texture is not None and model.uvs is not None:
         material.baseColorTexture = Image.fromarray(_limited(model.texture, texture_side))

@@ -293,8 +293,8 @@ def _tracked(entry: Mapping[str, Any]) -> tuple[str, TrackedFrame]:
 
 @dataclass(frozen=True, eq=False)
 class SavedResult:
-    """What a result.json, or a pose that the page saved, says. candidates: the poses; models: the mesh of each, by name.
-    image, meshes: files as they were named, none where it does not say. camera: its entry, which `view_of` takes."""
+    """What a result.json, or a pose that the page saved, says. candidates: the poses; models: the name of each one's
+    mesh. image, meshes: files as they were named, none where it does not say. camera: its entry, for `view_of`."""
 
     candidates: tuple[Candidate, ...]
     models: tuple[str, ...]
@@ -599,10 +599,8 @@ class PoseViewer:
 
     def show_picture(self, index: int) -> None:
         """Show another picture with its best candidate; the pose stays where it has none. Raises ImageError."""
-        self.shown = first_shown(self.pictures, index, self.model, self.shown.T_cam_obj)
-        self.history.clear()
-        self._show_photograph()
-        self._show()
+        self._wanted = index
+        self._load_picture(index)
 
     def refine(self) -> None:
         """Refine the pose that is shown. Raises what the refiner raises."""
@@ -742,11 +740,17 @@ class PoseViewer:
     def _ask_for_picture(self, index: float) -> None:
         self._wanted = int(index)
 
-        def show() -> None:  # only the last one that was asked for
+        def load() -> None:  # only the last one that was asked for, while a person pulls the slider
             if self.shown.index != self._wanted:
-                self.show_picture(self._wanted)
+                self._load_picture(self._wanted)
 
-        self._later(show)
+        self._later(load)
+
+    def _load_picture(self, index: int) -> None:
+        self.shown = first_shown(self.pictures, index, self.model, self.shown.T_cam_obj)
+        self.history.clear()
+        self._show_photograph()
+        self._show()
 
     def _show(self) -> None:
         """Bring the page to what is shown."""
@@ -766,7 +770,7 @@ class PoseViewer:
             c.step.disabled = steps == 0
             c.undo.disabled = not self.history
             if c.picture is not None:
-                c.picture.value = self._wanted = shown.index
+                c.picture.value = self._wanted
         self._say("")
 
     def _show_photograph(self) -> None:
@@ -791,8 +795,9 @@ class PoseViewer:
 
     def _busy(self, busy: bool) -> None:
         c = self.controls
-        for button in (c.refine, c.save, c.undo):
-            button.disabled = busy
+        c.refine.disabled = busy or self._refiner is None
+        c.undo.disabled = busy or not self.history
+        c.save.disabled = busy
         self.gizmo.visible = not busy and bool(c.gizmo.value)
 
     def _say(self, text: str) -> None:
