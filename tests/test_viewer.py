@@ -537,7 +537,7 @@ def canvas_camera(desk: Desk) -> Camera:
 def test_a_real_click_and_drag(desk: Desk, browser: Any) -> None:
     """Some 10 s, for a browser that draws without a GPU is slow."""
     shown, asked = desk.page, []
-    page = browser.new_page(viewport={"width": 900, "height": 560})
+    page = browser.new_page(viewport={"width": 1100, "height": 700})
     page.on("request", lambda request: asked.append(request.url))
     page.goto(shown.url)
     page.get_by_role("button", name="Refine from here").wait_for(timeout=60_000)

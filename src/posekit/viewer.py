@@ -193,13 +193,14 @@ class Photograph:
 
 @dataclass(frozen=True, eq=False)
 class TrackedFrame:
-    """A line of poses.jsonl. T_cam_obj: None where the object was lost."""
+    """A line of poses.jsonl. T_cam_obj: None where the object was lost. angle: predicted rotation error, radians."""
 
     number: int
     state: str
     T_cam_obj: Pose | None = None
     angle: float | None = None
     score: float | None = None
+    reliable: bool | None = None
 
 
 class TrackedVideo:
@@ -229,7 +230,8 @@ class TrackedVideo:
         if found.T_cam_obj is None:
             return []
         angle = "unknown" if found.angle is None else angle_in_words(math.degrees(found.angle))
-        note = f"{found.state}: expected rotation error {angle}"
+        doubt = ", NOT RELIABLE" if found.reliable is False else ""
+        note = f"{found.state}{doubt}: expected rotation error {angle}"
         return [
             Candidate("track", found.T_cam_obj, note + ("" if found.score is None else f"; score {found.score:.2f}"))
         ]
@@ -288,6 +290,7 @@ def _tracked(entry: Mapping[str, Any]) -> tuple[str, TrackedFrame]:
         None if matrix is None else Pose.from_matrix(matrix),
         None if angle is None else math.radians(angle),
         None if score is None else float(score),
+        entry.get("reliable"),
     )
 
 
