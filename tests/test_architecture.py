@@ -87,6 +87,7 @@ DOORS = {
     "av": {"video"},
     "rerun": {"recording"},
     "viser": {"viewer"},
+    "websockets": {"viewer"},
     "openvino": {"nets", "cli"},
 }
 

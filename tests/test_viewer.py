@@ -368,6 +368,28 @@ def test_the_page_is_for_this_machine_alone(desk: Desk) -> None:
     assert desk.page.server.request_share_url() is None, "no relay"
 
 
+@pytest.mark.parametrize(("origin", "welcome"), [("http://127.0.0.1:{}", True), ("http://localhost:9000", True),
+                                                 (None, True), ("http://example.org", False),
+                                                 ("http://127.0.0.1.example.org", False)])  # fmt: skip
+def test_pages_of_other_sites_are_refused(desk: Desk, origin: str | None, welcome: bool) -> None:
+    import viser
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    port = desk.page.server.get_port()
+    protocol, sender = f"viser-v{viser.__version__}", origin and origin.format(port)
+
+    def try_it() -> None:
+        with connect(f"ws://127.0.0.1:{port}", subprotocols=[protocol], origin=sender, max_size=None) as there:
+            assert there.recv(timeout=10)
+
+    if welcome:
+        try_it()
+    else:
+        with pytest.raises(InvalidStatus, match="403"):
+            try_it()
+
+
 def test_dragging_refining_and_saving(desk: Desk) -> None:
     page = desk.page
     moved = Pose(so3_exp([0, 0, 0.5]) @ POSE.R, [0.1, 0.0, 0.6])

@@ -11,10 +11,12 @@ import io
 import json
 import logging
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import redirect_stdout, suppress
+from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol
@@ -37,6 +39,7 @@ from posekit.view import View
 log = logging.getLogger("posekit")
 
 HOST = "127.0.0.1"
+OWN_ORIGIN = re.compile(r"http://(127\.0\.0\.1|localhost)(:[0-9]+)?")  # of pages, forwarded ports too
 LEVELS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)  # opacities that can be chosen; each but the first is a mesh of its own
 MOST_FACES = 20_000  # of the mesh on the page
 MOST_PIXELS = 2048  # longer side of the photograph on the page
@@ -499,15 +502,34 @@ def require_viser() -> Any:
 
 
 def _loopback_server(port: int) -> Any:
-    """A server that this machine alone reaches, and that no page can ask to be shared by viser's relay."""
+    """A server that this machine alone reaches, and there only programs and pages that it served itself; and that no
+    page can ask to be shared by viser's relay."""
     viser = require_viser()
 
     class LoopbackServer(viser.ViserServer):  # type: ignore[misc, name-defined]
         def request_share_url(self, verbose: bool = True) -> str | None:  # noqa: ARG002 - viser's signature
             return None
 
-    with redirect_stdout(io.StringIO()):  # viser prints where it listens; the command line says it in its own words
+    with (
+        _own_origin(),
+        redirect_stdout(io.StringIO()),
+    ):  # viser prints where it listens; the command says it in its words
         return LoopbackServer(HOST, port, label="posekit", verbose=False)
+
+
+@contextmanager
+def _own_origin() -> Iterator[None]:
+    """Servers that are started meanwhile refuse connections from pages of other sites. viser asks nobody where he comes
+    from, so any page in the browser could look at the photograph and move the mesh."""
+    import websockets.asyncio.server
+
+    server: Any = websockets.asyncio.server
+    started = server.serve
+    server.serve = partial(started, origins=[OWN_ORIGIN, None])
+    try:
+        yield
+    finally:
+        server.serve = started
 
 
 @dataclass
