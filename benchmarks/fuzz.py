@@ -13,6 +13,7 @@ The first input of each kind of fault is kept. An input depends on the reader, t
 from __future__ import annotations
 
 import argparse
+import copy
 import io
 import json
 import logging
@@ -572,7 +573,7 @@ def _json_changed(data: bytes, rng: random.Random) -> bytes:
         elif kind == 5:
             parent[last] = str(parent[last])
         else:
-            parent[last] = rng.choice(VALUES)
+            parent[last] = copy.deepcopy(rng.choice(VALUES))  # later changes reach into it
     return json.dumps(made).encode()
 
 

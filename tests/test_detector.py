@@ -332,6 +332,7 @@ def found_in(folder: Path, data: object, image: str = "000001.png", name: str = 
         ({"segmentation": {"size": [60, 80], "counts": "o" * 3000}}, "neither COCO's run lengths nor polygons"),
         ({"segmentation": [[1e9, 2, 3, 1e9, 5, 6]]}, "none beyond 100000 pixels"),
         ({"bbox": [10**400, 5, 9, 9]}, "no detection"),
+        ({"bbox": [10**400, 5.5, 9.5, 9]}, "no detection"),
         ({"category_id": "six"}, "entry 2 is skipped"),
         ({"image_id": None}, "entry 2 is skipped"),
     ],

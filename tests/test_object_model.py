@@ -12,7 +12,9 @@ from __future__ import annotations
 import json
 import logging
 import struct
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -787,8 +789,13 @@ def test_the_note_on_units_says_the_size(tmp_path: Path, caplog: pytest.LogCaptu
     assert "the object is 27 mm long" in caplog.text and "; in cm it is 27 cm long" in caplog.text
 
 
-def textured_glb(path: Path, moved: dict[str, object] | None, picture: bytes | None = None) -> None:
-    """A quad from trimesh, its colour texture moved, or replaced by another PNG."""
+def textured_glb(
+    path: Path,
+    moved: dict[str, object] | None,
+    picture: bytes | None = None,
+    material: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
+) -> None:
+    """A quad from trimesh, its colour texture moved, or replaced by another PNG. material: makes another of it."""
     scene = trimesh.Scene()
     scene.add_geometry(quad(plain_picture((200, 0, 0)), 0.0), geom_name="a")
     data = scene.export(file_type="glb")
@@ -798,6 +805,8 @@ def textured_glb(path: Path, moved: dict[str, object] | None, picture: bytes | N
         texture = document["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
         texture["extensions"] = {"KHR_texture_transform": moved}
         document["extensionsUsed"] = ["KHR_texture_transform"]
+    if material is not None:
+        document["materials"] = [material(document["materials"][0])]
     if picture is not None:
         start = len(buffer) + -len(buffer) % 4
         buffer = buffer.ljust(start, b"\0") + picture
@@ -834,6 +843,35 @@ def test_an_embedded_texture_of_twelve_bits_in_sixteen(tmp_path: Path, caplog: p
     texture = ObjectModel.load(tmp_path / "a.glb").texture
     assert texture is not None and texture[0, 0].tolist() == [255, 128, 0]
     assert "they are taken for 12 bits" in caplog.text
+
+
+@pytest.mark.parametrize("plain", [{}, {"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1]}}])
+def test_colours_of_specular_glossiness(tmp_path: Path, plain: dict[str, Any]) -> None:
+    def textured(material: dict[str, Any]) -> dict[str, Any]:
+        old = {"diffuseTexture": material["pbrMetallicRoughness"]["baseColorTexture"]}
+        return plain | {"extensions": {"KHR_materials_pbrSpecularGlossiness": old}}
+
+    def coloured(_: dict[str, Any]) -> dict[str, Any]:
+        return {"extensions": {"KHR_materials_pbrSpecularGlossiness": {"diffuseFactor": [0.0, 1.0, 0.0, 1.0]}}}
+
+    textured_glb(tmp_path / "a.glb", None, material=textured)
+    texture = ObjectModel.load(tmp_path / "a.glb").texture
+    assert texture is not None and texture[0, 0].tolist() == [200, 0, 0]  # it was white
+    textured_glb(tmp_path / "b.glb", None, material=coloured)
+    model = ObjectModel.load(tmp_path / "b.glb")
+    colours = model.colors if model.texture is None else model.texture.reshape(-1, 3)
+    assert colours is not None and colours[0].tolist() == [0, 255, 0]
+
+
+@pytest.mark.parametrize(("mode", "alpha", "told"), [("MASK", 0, True), ("MASK", 255, False), ("OPAQUE", 0, False)])
+def test_transparent_parts_are_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, mode: str, alpha: int, told: bool
+) -> None:
+    pixels = np.full((8, 8, 4), (0, 128, 255, 255), np.uint8)
+    pixels[:4, :, 3] = alpha
+    textured_glb(tmp_path / "a.glb", None, cv2.imencode(".png", pixels)[1].tobytes(), lambda m: m | {"alphaMode": mode})
+    assert ObjectModel.load(tmp_path / "a.glb").texture is not None
+    assert ("are transparent; they are drawn solid" in caplog.text) == told
 
 
 def test_limits_of_meshes_can_be_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

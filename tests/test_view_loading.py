@@ -250,6 +250,19 @@ def test_damaged_exif_does_not_stop_a_picture(tmp_path: Path, entries: list[byte
     assert load_view(tmp_path / "a.jpg").camera.size == ((48, 64) if turned else (64, 48))
 
 
+def test_an_orientation_behind_a_second_header_is_none(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0" + ORIENTATION + b"\0\0\0\0"
+    assert load_image(jpeg(tmp_path / "a.jpg", exif)).shape == (48, 64, 3)  # as viewers and OpenCV show it
+    assert "a second header" in caplog.text
+
+
+@pytest.mark.parametrize(("name", "way_out"), [("a.HEIC", "export it as JPEG"), ("a.dng", "developed first")])
+def test_files_of_phones_and_cameras_that_are_not_read(tmp_path: Path, name: str, way_out: str) -> None:
+    (tmp_path / name).write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + bytes(400))
+    with pytest.raises(ImageError, match=way_out):
+        load_image(tmp_path / name)
+
+
 @pytest.mark.parametrize(
     "exif", [b"", b"II*\0", b"II*\0\x08\0\0\0\x30\0" + ORIENTATION[:9], b"Exif\0\0MM\0*", b"x" * 30]
 )

@@ -120,6 +120,13 @@ def load_mask(path: str | Path, size: Size | None = None, *, allow_empty: bool =
     return mask
 
 
+_PHONES = " Phones save HEIC; they and most viewers export it as JPEG."
+_RAW = " A camera's raw file must be developed first: export it as JPEG or PNG."
+_WAY_OUT = dict.fromkeys((".heic", ".heif", ".hif"), _PHONES) | dict.fromkeys(
+    (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"), _RAW
+)
+
+
 @contextmanager
 def _opened(path: Path, what: str, kind: type[InputError]) -> Iterator[Image.Image]:
     """A picture that is whole; its header was checked before anything was decoded."""
@@ -145,6 +152,7 @@ def _opened(path: Path, what: str, kind: type[InputError]) -> Iterator[Image.Ima
     except UnidentifiedImageError as error:
         raise kind(
             f"the {what} {path} is not a picture that posekit reads: give a PNG, JPEG, TIFF, BMP or WebP."
+            f"{_WAY_OUT.get(path.suffix.lower(), '')}"
         ) from error
     except Image.DecompressionBombError as error:
         raise kind(_too_large(path, "far more pixels")) from error

@@ -88,7 +88,14 @@ def _tiff_tag(data: bytes, order: str, wanted: int) -> tuple[int, ...]:
 
 
 def upright(image: Image.Image, label: str) -> Image.Image:
-    """A picture turned as its EXIF data says; where they are damaged but say the orientation, by that alone."""
+    """A picture turned as its EXIF data says; where they are damaged but say the orientation, by that alone.
+
+    EXIF data behind a second header are no EXIF data: viewers, browsers and OpenCV see none there, Pillow does.
+    """
+    data = image.info.get("exif")
+    if isinstance(data, bytes) and data.startswith(b"Exif\0\0" * 2) and orientation(image) != 1:
+        log.warning("%s: its EXIF data are damaged (a second header); the picture is read as it is stored.", label)
+        return image
     try:
         with warnings.catch_warnings(action="ignore"):
             return ImageOps.exif_transpose(image)

@@ -212,7 +212,10 @@ def are_corners(boxes: Sequence[Sequence[float]], size: tuple[int, int], label: 
 
 
 def _four(values: Any) -> bool:
-    return isinstance(values, list) and len(values) == 4 and all(type(v) in (int, float) for v in values)
+    """Whether these are a box's four numbers: whole numbers of any length can be in JSON, and no pixel is that far."""
+    return (
+        isinstance(values, list) and len(values) == 4 and all(type(v) in (int, float) and abs(v) < 1e9 for v in values)
+    )
 
 
 def _box(values: Sequence[float], corners: bool) -> Box:
