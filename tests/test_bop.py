@@ -179,6 +179,9 @@ def test_annotations_that_do_not_fit(root: Path) -> None:
     put(folder / "scene_gt_info.json", {"3": []})
     with pytest.raises(InputError, match=r"has 0 entries for image 3, scene_gt.json 3: they belong together"):
         BopDataset(root).instances(2, 3)
+    put(folder / "scene_gt.json", {"3": []})
+    put(folder / "scene_gt_info.json", {"3": [{}]})
+    assert BopDataset(root).instances(2, 3) == []  # nothing in the picture, whatever is said about it
     put(folder / "scene_gt.json", {"3": [{"obj_id": 5, "cam_R_m2c": [0] * 9, "cam_t_m2c": [0, 0, 900]}]})
     put(folder / "scene_gt_info.json", {"3": [{"bbox_obj": [0] * 4, "bbox_visib": [0] * 4, "visib_fract": 1}]})
     with pytest.raises(InputError, match=r"annotation 0 of image 3 .* is not BOP's"):

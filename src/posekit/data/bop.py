@@ -248,6 +248,8 @@ class BopDataset:
         if image not in here.truths:
             raise InputError(f"{here.file('scene_gt')} has no annotations for image {image}.")
         truths = here.truths[image]
+        if not truths:
+            return []
         infos = here.infos.get(image, []) if here.infos is not None else [None] * len(truths)
         if len(infos) != len(truths):
             raise InputError(

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from posekit.camera import Box
+from posekit.detect.external import json_lines
 from posekit.detect.segmentation import decode
 from posekit.errors import InputError
 
@@ -234,6 +235,8 @@ class _Skipped:
         """used: entries that are left. Raises InputError where there are none but skipped ones."""
         if self.count > _TOLD:
             log.warning("%s: %d entries in all are skipped, %d are used.", self.path, self.count, used)
+        if not self.count and not used:
+            log.warning("%s holds no detections at all.", self.path)
         if self.count and not used:
             raise InputError(f"{self.path} has {self.count} entries and none that can be used; {self.first}.")
 
@@ -313,8 +316,13 @@ def _is_rle(rle: Any) -> bool:
 
 
 def _entries(path: Path) -> Iterator[tuple[int, Any]]:
-    """The entries of a JSON list, each with the line that it starts in."""
+    """The entries of a JSON list or of JSON Lines, each with the line that it starts in."""
     text = _text(path)
+    lines = json_lines(text)
+    if lines is not None:
+        numbers = [k + 1 for k, line in enumerate(text.split("\n")) if line.strip()]
+        yield from zip(numbers, lines, strict=True)
+        return
     decoder = json.JSONDecoder()
     at, line, counted = _skip(text, 0), 1, 0
     if not text[at : at + 1] == "[":
