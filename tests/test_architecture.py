@@ -14,7 +14,7 @@ SOURCE = Path(__file__).resolve().parent.parent / "src" / "posekit"
 # A room (a module of the top level, or a package) and its layer. Imports go down only.
 # Rooms that are planned stand here too; a room that is built must stand here.
 LAYERS = {
-    0: {"geometry", "camera", "files", "lens", "polygons", "pixels", "mesh_files", "gltf_files", "limits"},
+    0: {"geometry", "camera", "files", "lens", "polygons", "pixels", "mesh_files", "gltf_files", "ply_files", "limits"},
     1: {"view", "object_model", "results", "pose_formats"},
     2: {"load", "calibration", "zoom", "metrics", "pnp", "fusion", "render", "nets", "detect", "draw", "evidence"},
     3: {
@@ -49,6 +49,8 @@ SIBLINGS = {
 SIBLINGS |= {
     ("mesh_files", "polygons"),
     ("mesh_files", "gltf_files"),
+    ("mesh_files", "ply_files"),
+    ("ply_files", "polygons"),
     ("gltf_files", "pixels"),
     ("gltf_files", "limits"),
     ("lens", "camera"),

@@ -188,6 +188,13 @@ def test_annotations_that_do_not_fit(root: Path) -> None:
         BopDataset(root).instances(2, 3)
 
 
+def test_files_in_utf16_are_read(root: Path) -> None:
+    for path in (root / "test" / "000002").glob("*.json"):
+        path.write_bytes(path.read_text().encode("utf-16"))
+    data = BopDataset(root)
+    assert data.instances(2, 3) and data.view(2, 3)
+
+
 def test_a_damaged_photograph(root: Path) -> None:
     (root / "test" / "000002" / "rgb" / "000003.png").write_bytes(b"\x89PNG")
     with pytest.raises(ImageError):

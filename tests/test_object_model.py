@@ -765,6 +765,127 @@ def test_stl_that_is_cut_off(tmp_path: Path) -> None:
         ObjectModel.load(binary_stl(tmp_path / "a.stl", 20, bytes(20)))
 
 
+@pytest.mark.parametrize("told", [12, 5])
+def test_bytes_behind_the_triangles_of_an_stl(told: int, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    assert len(ObjectModel.load(binary_stl(tmp_path / "a.stl", told, bytes(7))).faces) == told
+    assert f"bytes follow its {told} triangles and are not read" in caplog.text
+
+
+def mixed_ply(path: Path, order: str, *, colours: str = "", cut: int = 0, changed: int | None = None) -> Path:
+    """A prism over an L in binary PLY: two polygons of six corners, six of four. colours: of the faces, "before" or
+    "after" their corners."""
+    corners = [(100, 10), (10, 10), (10, 80), (0, 80), (0, 0), (100, 0)]
+    polygons = [[11, 10, 9, 8, 7, 6][::-1], [5, 4, 3, 2, 1, 0]]
+    polygons += [[k, (k + 1) % 6, 6 + (k + 1) % 6, 6 + k] for k in range(6)]
+    rgb = "property uchar red\nproperty uchar green\nproperty uchar blue\n"
+    head = (
+        f"ply\nformat binary_{'little' if order == '<' else 'big'}_endian 1.0\nelement vertex 12\nproperty float x\n"
+        f"property float y\nproperty double z\nelement face 8\n{rgb if colours == 'before' else ''}"
+        f"property list uint8 uint vertex_indices\n{rgb if colours == 'after' else ''}end_header\n"
+    ).encode()
+    data = b"".join(struct.pack(order + "ffd", x, y, z) for z in (0, 12) for x, y in corners)
+    for k, polygon in enumerate(polygons):
+        row = struct.pack(f"{order}B{len(polygon)}I", len(polygon), *polygon)
+        colour = bytes((30 * k, 5, 6))
+        data += colour + row if colours == "before" else row + colour if colours == "after" else row
+    if changed is not None:  # the first polygon's number of corners
+        at = 12 * 16 + (3 if colours == "before" else 0)
+        data = data[:at] + bytes([changed]) + data[at + 1 :]
+    path.write_bytes(head + data[: len(data) - cut])
+    return path
+
+
+def surface(model: ObjectModel) -> float:
+    a, b, c = (np.asarray(model.vertices, dtype=np.float64)[model.faces[:, k]] for k in range(3))
+    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("colours", ["", "before", "after"])
+def test_polygons_of_different_sizes_in_a_binary_ply(order: str, colours: str, tmp_path: Path) -> None:
+    """As Blender writes quads and triangles together."""
+    model = ObjectModel.load(mixed_ply(tmp_path / "a.ply", order, colours=colours), units="mm")
+    assert len(model.faces) == 2 * 4 + 6 * 2
+    assert surface(model) == pytest.approx((2 * 1700 + 360 * 12) * 1e-6)  # a fan would leave the L
+    if colours:
+        assert model.colors is not None
+        assert np.unique(model.colors, axis=0).tolist() == [[30 * k, 5, 6] for k in range(8)]
+
+
+@pytest.mark.parametrize(("cut", "changed"), [(1, None), (40, None), (0, 200), (0, 0)])
+def test_a_damaged_binary_ply_of_polygons(cut: int, changed: int | None, tmp_path: Path) -> None:
+    with pytest.raises(MeshError, match=r"a.ply (cannot be read as PLY|has a face that names vertex)"):
+        ObjectModel.load(mixed_ply(tmp_path / "a.ply", "<", cut=cut, changed=changed))
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.obj", "a.stl", "a.glb"])
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\n", "git lfs pull"),
+        ("\n<!DOCTYPE html><html></html>", "holds a web page"),
+    ],
+)
+def test_files_that_hold_something_else(name: str, text: str, reason: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(MeshError, match=reason):
+        ObjectModel.load(tmp_path / name)
+
+
+def test_texts_in_utf16_are_read(tmp_path: Path) -> None:
+    corners = "".join("v {} {} {}\n".format(*corner) for corner in CORNERS)
+    faces = "".join("f {} {} {}\n".format(*(face + 1)) for face in FACES)
+    (tmp_path / "a.obj").write_bytes((corners + faces).encode("utf-16"))
+    assert len(ObjectModel.load(tmp_path / "a.obj").faces) == 12
+
+
+@pytest.mark.parametrize("names", ["Red Green Blue", "ambient_red ambient_green ambient_blue"])
+def test_more_names_of_colours(names: str, tmp_path: Path) -> None:
+    properties = "".join(f"property uchar {name}\n" for name in names.split())
+    rows = "".join("{} {} {} 9 80 200\n".format(*corner) for corner in CORNERS)
+    faces = "".join("3 {} {} {}\n".format(*face) for face in FACES)
+    (tmp_path / "a.ply").write_text(
+        f"ply\nformat ascii 1.0\nelement vertex 8\nproperty float x\nproperty float y\nproperty float z\n{properties}"
+        f"element face 12\nproperty list uchar int vertex_indices\nend_header\n{rows}{faces}"
+    )
+    colours = ObjectModel.load(tmp_path / "a.ply").colors
+    assert colours is not None and colours[0].tolist() == [9, 80, 200]
+
+
+def test_colours_of_a_material_up_to_255(tmp_path: Path) -> None:
+    corners = "".join("v {} {} {}\n".format(*corner) for corner in CORNERS)
+    faces = "".join("f {} {} {}\n".format(*(face + 1)) for face in FACES)
+    (tmp_path / "a.mtl").write_text("newmtl m\nKd 200 30 0\n")
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{corners}usemtl m\n{faces}")
+    colours = ObjectModel.load(tmp_path / "a.obj").colors
+    assert colours is not None and colours[0].tolist() == [200, 30, 0]
+
+
+def test_vertex_colours_that_are_not_understood_are_not_drawn(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    corners = "".join("v {} {} {} -0.5 0.5 0.9\n".format(*corner) for corner in CORNERS)
+    faces = "".join("f {} {} {}\n".format(*(face + 1)) for face in FACES)
+    (tmp_path / "a.obj").write_text(f"#MRGB ff00ff00\n{corners}{faces}")
+    assert ObjectModel.load(tmp_path / "a.obj").colors is None
+    assert "it is drawn grey" in caplog.text and "#MRGB" in caplog.text
+
+
+@pytest.mark.parametrize(("extension", "told"), [("FOO_bar", "needs FOO_bar, which posekit does not know"),
+                                                 ("KHR_texture_basisu", "compressed with Basis")])  # fmt: skip
+def test_extensions_that_change_what_is_seen_are_told(
+    extension: str, told: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    textured_glb(tmp_path / "a.glb", None)
+    data = (tmp_path / "a.glb").read_bytes()
+    length = int.from_bytes(data[12:16], "little")
+    document = json.loads(data[20 : 20 + length]) | {"extensionsRequired": [extension], "extensionsUsed": [extension]}
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sIII", b"glTF", 2, len(data) - length + len(text), len(text)) + b"JSON"
+    (tmp_path / "a.glb").write_bytes(head + text + data[20 + length :])
+    assert len(ObjectModel.load(tmp_path / "a.glb").faces)
+    assert told in caplog.text
+
+
 @pytest.mark.parametrize(("extension", "name"), [("KHR_draco_mesh_compression", "Draco"),
                                                  ("EXT_meshopt_compression", "meshopt")])  # fmt: skip
 def test_compressed_geometry_is_named(extension: str, name: str, tmp_path: Path) -> None:

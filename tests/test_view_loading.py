@@ -256,6 +256,17 @@ def test_an_orientation_behind_a_second_header_is_none(tmp_path: Path, caplog: p
     assert "a second header" in caplog.text
 
 
+def test_a_picture_that_is_a_pointer_of_git_lfs(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
+    with pytest.raises(ImageError, match=r"the picture .*a.png holds a pointer of Git LFS .* git lfs pull"):
+        load_image(tmp_path / "a.png")
+
+
+def test_a_pose_in_utf16_is_read(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_bytes(json.dumps({"T_cam_obj": np.eye(4).tolist()}).encode("utf-16"))
+    assert load_pose(tmp_path / "a.json").t.tolist() == [0, 0, 0]
+
+
 @pytest.mark.parametrize(("name", "way_out"), [("a.HEIC", "export it as JPEG"), ("a.dng", "developed first")])
 def test_files_of_phones_and_cameras_that_are_not_read(tmp_path: Path, name: str, way_out: str) -> None:
     (tmp_path / name).write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + bytes(400))

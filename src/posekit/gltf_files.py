@@ -27,6 +27,9 @@ _COMPRESSED = {
     "KHR_meshopt_compression": "meshopt",
 }
 _TRANSFORM, _GLOSSINESS = "KHR_texture_transform", "KHR_materials_pbrSpecularGlossiness"
+_UNDERSTOOD = {
+    _TRANSFORM, _GLOSSINESS, "KHR_mesh_quantization", "KHR_materials_unlit", "EXT_texture_webp", "KHR_texture_basisu",
+}  # fmt: skip
 _WRONG = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, struct.error)
 
 
@@ -50,6 +53,12 @@ def gltf_put_right(kind: str, data: bytes, label: str, fetch: Callable[[str], by
                 f"{label} is compressed with {name}, which posekit does not read: export it without compression "
                 f"(in Blender leave out Compression; or gltf-transform copy {label} plain.glb), or as PLY."
             )
+    if "KHR_texture_basisu" in used:
+        log.warning("%s: its textures are compressed with Basis Universal, which posekit does not read.", label)
+    if strange := sorted({*document.root.get("extensionsRequired", ())} - _UNDERSTOOD):
+        log.warning(
+            "%s needs %s, which posekit does not know: look at it with posekit render-views.", label, ", ".join(strange)
+        )
     most = 3 * limit("POSEKIT_MOST_FACES")
     if max(counts, default=0) > most:
         raise MeshError(

@@ -19,6 +19,7 @@ from PIL import Image, UnidentifiedImageError
 from posekit.calibration import Calibration, load_calibration
 from posekit.camera import Box, Camera
 from posekit.errors import CameraError, ImageError, InputError, PromptError
+from posekit.files import other_content, read_text
 from posekit.geometry import Pose, nearest_rotation
 from posekit.limits import limit
 from posekit.pixels import deep_colour, eight_bit, upright
@@ -150,6 +151,8 @@ def _opened(path: Path, what: str, kind: type[InputError]) -> Iterator[Image.Ima
                     whole = _cut_short(path, image, error)
                 yield whole
     except UnidentifiedImageError as error:
+        if (content := other_content(path.read_bytes())) is not None:
+            raise kind(f"the {what} {path} {content}.") from error
         raise kind(
             f"the {what} {path} is not a picture that posekit reads: give a PNG, JPEG, TIFF, BMP or WebP."
             f"{_WAY_OUT.get(path.suffix.lower(), '')}"
@@ -322,7 +325,7 @@ def load_pose(path: str | Path) -> Pose:
         '"cam_t_m2c": 3 numbers in mm}, or a text file with a 4x4 matrix or x y z qx qy qz qw, in metres.'
     )
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_text(path)
         pose = _pose_from_json(json.loads(text), path, needed) if "{" in text else pose_from_text(text)
     except OSError as error:
         raise PromptError(f"the pose file {path} cannot be read ({error.strerror}): check the path.") from error

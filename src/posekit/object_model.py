@@ -23,9 +23,10 @@ from scipy.spatial import ConvexHull, KDTree
 from scipy.spatial.distance import pdist
 
 from posekit.errors import MeshError
+from posekit.files import other_content, read_text
 from posekit.geometry import Pose, fibonacci_sphere, hat, rotation_angle, so3_exp
 from posekit.limits import limit
-from posekit.mesh_files import ply_colours, ply_faces, put_right
+from posekit.mesh_files import colours_8bit, ply_colours, ply_faces, put_right
 from posekit.pixels import deep_colour, eight_bit
 
 log = logging.getLogger("posekit")
@@ -606,6 +607,7 @@ def _spellings(name: str) -> list[str]:
     """What a file may be called that a mesh names: as it stands, without an MTL's options before it, %20 decoded, and
     its base name alone, of paths on other machines."""
     plain = [name, name.split()[-1]] if name.startswith("-") and name.split() else [name]
+    plain += [each.split(" #")[0].rstrip() for each in plain if " #" in each]  # a comment
     decoded = [urllib.parse.unquote(each) for each in plain]
     return list(dict.fromkeys([*plain, *decoded, *(each.rsplit("/", 1)[-1] for each in decoded)]))
 
@@ -625,6 +627,8 @@ def _read(path: Path) -> list[_Part]:
         raise MeshError(f"the mesh {path} cannot be read: {error.strerror}.") from error
     if not data.strip():
         raise MeshError(f"{path.name} is an empty file: export the mesh again.")
+    if (content := other_content(data)) is not None:
+        raise MeshError(f"{path.name} {content}.")
     assets = _Assets(path)
     try:
         loaded = trimesh.load(
@@ -736,7 +740,8 @@ def _with_material(part: _Part, mesh: Any, label: str) -> _Part:
     uvs = mesh.visual.uv
     factor = getattr(material, "baseColorFactor", None)  # glTF
     if factor is None and "kd" in getattr(material, "kwargs", {}):  # MTL
-        factor = material.diffuse
+        scaled = colours_8bit(np.asarray([material.kwargs["kd"]], dtype=np.float64), label)
+        factor = None if scaled is None else scaled[0]
     if image is not None and uvs is not None and len(uvs) == count:
         deep = image.mode.startswith("I")  # 16 bits of grey
         grey = eight_bit(np.asarray(image).astype(np.int64), label) if deep else None
@@ -950,7 +955,7 @@ def _symmetries(given: str | Symmetries | None, path: Path, model: ObjectModel) 
 def _symmetries_from_file(file: Path, mesh: Path) -> Symmetries:
     """The entry for a mesh in a file of models_info.json's form, or of an entry's own form (mm)."""
     try:
-        data = json.loads(file.read_text(encoding="utf-8-sig"))
+        data = json.loads(read_text(file))
         if not isinstance(data, dict):
             raise ValueError("its outermost part is not {...}")
         number = re.fullmatch(r"obj_(\d+)", mesh.stem)

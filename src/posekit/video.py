@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from posekit.calibration import Calibration, calibration_of_entry, depends_on_picture, load_calibration
 from posekit.camera import Camera
 from posekit.errors import ImageError, InputError, OutputError
+from posekit.files import read_text
 from posekit.load import ASSUMED_FOV, camera_from_exif, load_image
 
 log = logging.getLogger("posekit")
@@ -176,7 +177,7 @@ class SceneFrames:
     def __init__(self, file: Path) -> None:
         """file: scene_camera.json, or a sensor's."""
         try:
-            cameras = json.loads(file.read_text(encoding="utf-8-sig"))
+            cameras = json.loads(read_text(file))
             self.cameras: Mapping[int, Any] = {int(k): v for k, v in sorted(cameras.items(), key=lambda kv: int(kv[0]))}
         except (OSError, ValueError, AttributeError, RecursionError) as error:
             raise InputError(f"{file} cannot be read: {error}.") from error

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from posekit.calibration import calibration_of_entry
 from posekit.camera import Box, Camera
 from posekit.errors import CameraError, ImageError, InputError, MeshError
+from posekit.files import read_text
 from posekit.geometry import Pose
 from posekit.load import load_image, load_mask, pose_from_bop
 from posekit.object_model import UNITS, ObjectModel
@@ -462,7 +463,7 @@ def _mesh(path: Path, stated: float | None) -> ObjectModel:
 
 def _json(path: Path) -> Any:
     try:
-        return json.loads(path.read_text(encoding="utf-8-sig"))
+        return json.loads(read_text(path))
     except FileNotFoundError as error:
         raise InputError(f"there is no file {path}: this copy of the data set is not complete.") from error
     except (OSError, ValueError, RecursionError) as error:

@@ -15,6 +15,7 @@ from posekit.camera import Box, mask_box
 from posekit.detect.prompts import clip_box
 from posekit.detect.segmentation import decode, encode, xywh
 from posekit.errors import PromptError
+from posekit.files import read_text
 from posekit.object_model import ObjectModel
 from posekit.results import Detection, Source
 from posekit.view import View
@@ -46,7 +47,7 @@ class DetectionsFile:
         none for this picture, and says which pictures it has.
         """
         try:
-            text = path.read_text(encoding="utf-8-sig")
+            text = read_text(path)
             data = json_lines(text) or json.loads(text)
         except (OSError, ValueError, RecursionError) as error:
             raise PromptError(f"the detections {path} cannot be read ({error}): give {_FORMS}.") from error

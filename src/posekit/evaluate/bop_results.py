@@ -21,6 +21,7 @@ from posekit.camera import Box
 from posekit.detect.external import json_lines
 from posekit.detect.segmentation import decode
 from posekit.errors import InputError
+from posekit.files import read_text
 
 COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 _LOOSE = 0.01  # how far R R^T may be from the identity: files are rounded
@@ -358,7 +359,7 @@ def _skip(text: str, at: int) -> int:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8-sig")
+        return read_text(path)
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise InputError(f"{path} cannot be read: {reason}. Check the path.") from error

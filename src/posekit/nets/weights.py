@@ -17,7 +17,7 @@ from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from posekit.errors import ConfigError, WeightsError
-from posekit.files import write_bytes_atomic, write_text_atomic
+from posekit.files import other_content, write_bytes_atomic, write_text_atomic
 from posekit.nets.lite import LiteConfig, LiteSVNet
 from posekit.nets.mvnet import MatchingMVNet
 from posekit.nets.paper import Branch, PaperMVNet, PaperSVNet
@@ -140,6 +140,8 @@ def load_networks(preset: str, path: Path | None = None) -> Networks:
     except FileNotFoundError as error:
         raise WeightsError(f"{file.name} needs {about_file.name} beside it: {error}") from error
     except (OSError, ValueError, RecursionError, SafetensorError) as error:
+        if file.is_file() and (content := other_content(file.read_bytes())) is not None:
+            raise WeightsError(f"{file} {content}.") from error
         raise WeightsError(f"the weights {file} are damaged: {error}. Fetch or train them anew.") from error
     if head.get("preset") != preset:
         raise WeightsError(f"{file} holds weights of preset {head.get('preset')!r}, not {preset!r}.")

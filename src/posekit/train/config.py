@@ -15,6 +15,7 @@ import tomli_w
 
 from posekit.data.stream import StreamConfig
 from posekit.errors import ConfigError
+from posekit.files import read_text
 from posekit.nets.lite import LiteConfig
 from posekit.nets.losses import DenseLossConfig
 from posekit.nets.weights import PaperConfig
@@ -159,7 +160,7 @@ def default_config(recipe: str) -> TrainConfig:
 def read_config(path: Path) -> TrainConfig:
     """A TOML file; what it does not name stays as `default_config` has it. Raises ConfigError."""
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        values = tomllib.loads(read_text(path))
     except FileNotFoundError as error:
         raise ConfigError(f"there is no configuration {path}.") from error
     except (OSError, ValueError, RecursionError) as error:  # also thousands of digits, or of brackets
