@@ -1,10 +1,12 @@
 """Meshes from files of every kind, their units, symmetries, normals, and what is refused.
 
-Accepted: PLY, OBJ, STL, GLB and glTF; polygons, concave ones too; colours of vertices, faces and materials in whatever
-numbers; textures of 8 and 16 bits in the mesh's folder, moved by KHR_texture_transform; units mm, cm, m, in. Told:
-units that were guessed, colours that are not understood, an STL with a wrong count. Refused: what is missing, empty,
-damaged, without faces, compressed, a polygon that crosses itself, vertices that are not finite or beyond 1e12, files
-named by it that are not there or lie elsewhere, more than POSEKIT_MOST_FACES or POSEKIT_MOST_MESH_BYTES.
+Accepted: PLY, OBJ, STL, GLB and glTF; polygons, concave ones and different ones in a binary PLY too; OBJ in UTF-16;
+colours of vertices, faces and materials in whatever numbers; textures of 8 and 16 bits in the mesh's folder, moved by
+KHR_texture_transform; KHR_materials_pbrSpecularGlossiness; units mm, cm, m, in. Told: units that were guessed, colours,
+textures and extensions that are not understood, transparent parts (drawn solid), an STL with a wrong count or bytes
+behind its triangles. Refused: what is missing, empty, damaged, a pointer of Git LFS or a web page, without faces,
+compressed, a polygon that crosses itself, vertices that are not finite or beyond 1e12, files named by it that are not
+there or lie elsewhere, more than POSEKIT_MOST_FACES or POSEKIT_MOST_MESH_BYTES.
 """
 
 from __future__ import annotations

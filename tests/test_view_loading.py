@@ -1,9 +1,10 @@
 """Photographs, masks, boxes and poses from files, and every way in which they are refused.
 
 Photographs. Accepted: PNG, JPEG, TIFF, BMP, WebP, GIF's first picture, grey, palette, CMYK, transparent, 8 and 16 bits,
-turned by EXIF. Warned about: 10 and 12 bits in a file of 16, damaged EXIF data, a baseline JPEG that lacks a few of its
-last rows, a camera that nobody knows. Refused: what is missing, empty, no picture, damaged, cut off further up, of
-floating-point numbers, under 16 pixels a side or over POSEKIT_MOST_PIXELS.
+turned by EXIF. Warned about: 10 and 12 bits in a file of 16, damaged EXIF data or a second header of them (not turned),
+a baseline JPEG that lacks a few of its last rows, a camera that nobody knows. Refused: what is missing, empty, no
+picture (HEIC, raw files, pointers of Git LFS and web pages are named), damaged, cut off further up, of floating-point
+numbers, under 16 pixels a side or over POSEKIT_MOST_PIXELS.
 Masks. Accepted: any picture, white where the object is, brighter than half. Warned about: values in between, what looks
 inverted. Refused: labels, another size than the photograph's, nothing in it.
 Poses. Accepted: T_cam_obj in metres or its 4x4 numbers alone, a result.json, BOP's pair in mm. Refused: all else.
