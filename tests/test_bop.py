@@ -1,4 +1,6 @@
-"""BOP data sets. Accepted: pictures in rgb or gray with any suffix, folders and pictures with zeros or not, PLY, OBJ, GLB
+"""BOP data sets.
+
+Accepted: pictures in rgb or gray with any suffix, folders and pictures with zeros or not, PLY, OBJ, GLB
 and STL meshes in mm, JSON with a byte order mark or in UTF-16, pictures with nothing in them, no scene_gt_info, no
 targets or BOP'24's, a sensor's files (scene_camera_SENSOR.json, rgb_SENSOR; chosen as test:SENSOR where there are
 several). Warned about: meshes in another unit (by the stated diameter, or where mm make no object), a stated diameter
