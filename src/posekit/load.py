@@ -8,7 +8,7 @@ import logging
 import math
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +87,12 @@ def load_image(path: str | Path) -> NDArray[np.uint8]:
                 f"{path.name} is {width}x{height} pixels: at least {SMALLEST_SIDE}x{SMALLEST_SIDE} are needed. "
                 "Give the photograph itself."
             )
+        with suppress(Exception):  # Pillow counts by reading, and stumbles over what is damaged behind the first one
+            if image.format == "TIFF" and (pictures := getattr(image, "n_frames", 1)) > 1:
+                log.warning(
+                    "%s holds %d pictures: the first one, %dx%d pixels, is read.", path.name, pictures, width, height
+                )
+                image.seek(0)
         deep = deep_colour(path.read_bytes())
         if deep is not None:
             shallow = Image.fromarray(eight_bit(deep, path.name))
@@ -111,6 +117,7 @@ def load_mask(path: str | Path, size: Size | None = None, *, allow_empty: bool =
                 "a mask has the size of its picture."
             )
         mask = _covered(_brightness(image), path.name)
+        _refuse_labels(image, mask, path.name)
     if not mask.any() and not allow_empty:
         raise PromptError(f"the mask {path.name} is empty: its pixels must be brighter than 0 where the object is.")
     if mask[[0, 0, -1, -1], [0, -1, 0, -1]].all() and mask.mean() > 0.5:
@@ -121,6 +128,8 @@ def load_mask(path: str | Path, size: Size | None = None, *, allow_empty: bool =
     return mask
 
 
+_MOST_LABELS, _SAME_HUE = 64, 0.97
+_GREY_SHARE, _COLOUR_SHARE = 0.2, 0.01  # of the mask, that an area of another value or colour has
 _PHONES = " Phones save HEIC; they and most viewers export it as JPEG."
 _RAW = " A camera's raw file must be developed first: export it as JPEG or PNG."
 _WAY_OUT = dict.fromkeys((".heic", ".heif", ".hif"), _PHONES) | dict.fromkeys(
@@ -234,6 +243,26 @@ def _covered(brightness: NDArray[np.float64], label: str) -> NDArray[np.bool_]:
             label, most, 100 * between.mean(),
         )  # fmt: skip
     return np.asarray(brightness > 0.5 * most)
+
+
+def _refuse_labels(image: Image.Image, mask: NDArray[np.bool_], label: str) -> None:
+    """Raises PromptError where what is bright enough has areas of several values or colours: labels of objects."""
+    grey = image.mode in ("1", "L", "F") or image.mode.startswith("I")
+    values = np.asarray(image if grey else image.convert("RGB"))[mask].reshape(-1, 1 if grey else 3)
+    kinds, counts = np.unique(values, axis=0, return_counts=True)
+    order = np.argsort(-counts, kind="stable")
+    large = kinds[order[counts[order] > (_GREY_SHARE if grey else _COLOUR_SHARE) * len(values)]].astype(float)
+    if len(kinds) > _MOST_LABELS or len(large) < 2:
+        return
+    first = large[0]
+    for other in large[1:]:
+        if not grey and first @ other > _SAME_HUE * np.linalg.norm(first) * np.linalg.norm(other):
+            continue  # a soft edge
+        shown = [f"{each[0]:g}" if grey else "#{:02x}{:02x}{:02x}".format(*each.astype(int)) for each in (first, other)]
+        raise PromptError(
+            f"the mask {label} has areas of {shown[0]} and {shown[1]}, as a picture of labels does: write a mask that "
+            "is 255 where the one object is, and 0 elsewhere."
+        )
 
 
 def parse_box(text: str, size: Size | None = None) -> Box:
