@@ -854,6 +854,16 @@ def test_more_names_of_colours(names: str, tmp_path: Path) -> None:
     assert colours is not None and colours[0].tolist() == [9, 80, 200]
 
 
+def test_texture_coordinates_that_are_no_pairs(tmp_path: Path) -> None:
+    corners = "".join("v {} {} {}\n".format(*corner) for corner in CORNERS)
+    faces = "".join("f {}/1 {}/2 {}/3\n".format(*(face + 1)) for face in FACES)
+    Image.new("RGB", (8, 8)).save(tmp_path / "a.png")
+    (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd a.png\n")
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{corners}vt 0 0\nvt 1 0\nvt 1\n1\nusemtl m\n{faces}")
+    with pytest.raises(MeshError, match="texture coordinates that are no pairs of numbers"):
+        ObjectModel.load(tmp_path / "a.obj")
+
+
 def test_colours_of_a_material_up_to_255(tmp_path: Path) -> None:
     corners = "".join("v {} {} {}\n".format(*corner) for corner in CORNERS)
     faces = "".join("f {} {} {}\n".format(*(face + 1)) for face in FACES)

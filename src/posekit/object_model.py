@@ -748,7 +748,10 @@ def _with_material(part: _Part, mesh: Any, label: str) -> _Part:
         texture = np.asarray((image if grey is None else Image.fromarray(grey)).convert("RGB"), dtype=np.uint8)
         if factor is not None and not hasattr(material, "image"):  # in MTL files Kd beside a texture is mostly noise
             texture = np.rint(texture * (np.asarray(factor, dtype=np.float64)[:3] / 255.0)).astype(np.uint8)
-        return replace(part, uvs=np.asarray(uvs, dtype=np.float64), texture=texture)
+        places = np.asarray(uvs, dtype=np.float64)
+        if places.ndim != 2 or places.shape[1] < 2:
+            raise MeshError(f"{label} has texture coordinates that are no pairs of numbers: export it again.")
+        return replace(part, uvs=places[:, :2], texture=texture)
     if image is not None:
         log.warning("%s: a part has a texture but no texture coordinates; it gets its material's one colour.", label)
     colors = mesh.visual.vertex_attributes.get("color")
