@@ -854,6 +854,23 @@ def test_more_names_of_colours(names: str, tmp_path: Path) -> None:
     assert colours is not None and colours[0].tolist() == [9, 80, 200]
 
 
+@pytest.mark.parametrize("embedded", [True, False])
+def test_textures_are_limited(embedded: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("POSEKIT_MOST_PIXELS", "1000")
+    if embedded:
+        textured_glb(tmp_path / "a.glb", None, cv2.imencode(".png", np.zeros((40, 40, 3), np.uint8))[1].tobytes())
+    else:
+        Image.new("RGB", (40, 40)).save(tmp_path / "a.png")
+        (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd a.png\n")
+        (tmp_path / "a.obj").write_text(
+            "mtllib a.mtl\nv 0 0 0\nv 90 0 0\nv 0 90 0\nvt 0 0\nvt 1 0\nvt 1 1\nusemtl m\nf 1/1 2/2 3/3\n"
+        )
+    with pytest.raises(
+        MeshError, match=r"has a texture of 40x40 pixels, at most 0.001 megapixels .* POSEKIT_MOST_PIXELS"
+    ):
+        ObjectModel.load(next(path for path in tmp_path.iterdir() if path.suffix in (".glb", ".obj")))
+
+
 def test_texture_coordinates_that_are_no_pairs(tmp_path: Path) -> None:
     corners = "".join("v {} {} {}\n".format(*corner) for corner in CORNERS)
     faces = "".join("f {}/1 {}/2 {}/3\n".format(*(face + 1)) for face in FACES)

@@ -8,6 +8,7 @@ import json
 import logging
 import re
 import urllib.parse
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -573,7 +574,10 @@ class _Assets(trimesh.resolvers.FilePathResolver):
         if found.suffix.lower() in (".mtl", ".bin"):
             return data
         try:
-            with Image.open(io.BytesIO(data)) as image:
+            with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(data)) as image:  # of the size
+                if (large := _too_many_pixels(image)) is not None:
+                    self.problem = self.problem or large
+                    raise FileNotFoundError(name)
                 image.load()
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
             self.problem = self.problem or f"has the texture {found}, which is not a readable picture ({error})"
@@ -661,6 +665,17 @@ def _check_bytes(path: Path) -> None:
         )
 
 
+def _too_many_pixels(image: Image.Image) -> str | None:
+    """What is wrong with a texture that is too large to be read."""
+    most = limit("POSEKIT_MOST_PIXELS")
+    if image.width * image.height <= most:
+        return None
+    return (
+        f"has a texture of {image.width}x{image.height} pixels, at most {most / 1e6:g} megapixels are read: scale it "
+        "down, or set POSEKIT_MOST_PIXELS"
+    )
+
+
 def _reading_options(path: Path, data: bytes) -> dict[str, Any]:
     """What trimesh has to be told about a file's contents."""
     kind = path.suffix.lower()
@@ -743,11 +758,13 @@ def _with_material(part: _Part, mesh: Any, label: str) -> _Part:
         scaled = colours_8bit(np.asarray([material.kwargs["kd"]], dtype=np.float64), label)
         factor = None if scaled is None else scaled[0]
     if image is not None and uvs is not None and len(uvs) == count:
+        if (large := _too_many_pixels(image)) is not None:
+            raise MeshError(f"{label} {large}.")
         deep = image.mode.startswith("I")  # 16 bits of grey
         grey = eight_bit(np.asarray(image).astype(np.int64), label) if deep else None
         texture = np.asarray((image if grey is None else Image.fromarray(grey)).convert("RGB"), dtype=np.uint8)
         if factor is not None and not hasattr(material, "image"):  # in MTL files Kd beside a texture is mostly noise
-            texture = np.rint(texture * (np.asarray(factor, dtype=np.float64)[:3] / 255.0)).astype(np.uint8)
+            texture = _scaled(texture, np.asarray(factor, dtype=np.float64)[:3] / 255.0)
         places = np.asarray(uvs, dtype=np.float64)
         if places.ndim != 2 or places.shape[1] < 2:
             raise MeshError(f"{label} has texture coordinates that are no pairs of numbers: export it again.")
@@ -763,6 +780,14 @@ def _with_material(part: _Part, mesh: Any, label: str) -> _Part:
         log.warning("%s: a part has texture coordinates but no texture and no colour; it is drawn grey.", label)
         return part
     return replace(part, colors=np.tile(np.asarray(factor)[:3].astype(np.uint8), (count, 1)))
+
+
+def _scaled(texture: NDArray[np.uint8], factor: Floats) -> NDArray[np.uint8]:
+    """A texture (H, W, 3) times a colour (3,) in [0, 1]."""
+    if (factor == 1).all():
+        return texture
+    tables = np.rint(np.arange(256)[:, None] * factor).astype(np.uint8)
+    return np.stack([tables[:, k][texture[..., k]] for k in range(3)], axis=-1)
 
 
 def _placed(part: _Part, transform: Floats) -> _Part:
