@@ -1,7 +1,7 @@
 """Frames in and out: what can be read is, and the rest is told.
 
-Accepted: videos that FFmpeg decodes, turned and mirrored as players do, with titles in any letters; folders and globs of
-pictures, in the order of the numbers in their names; a BOP scene or a sensor's scene_camera_SENSOR.json; a camera's
+Accepted: videos that FFmpeg decodes, turned and mirrored as players do, with titles in any letters; folders and globs
+of pictures, in the order of the numbers in their names; a BOP scene or a sensor's scene_camera_SENSOR.json; a camera's
 number; a camera for each picture, EXIF data, lens distortion. Told frame by frame: what cannot be decoded, a damaged
 picture, a size of another shape; a truncated video ends early. Warned of: a camera that is not known. Refused: what is
 not there or is no video, a video without pictures in it, a folder without pictures, several sensors, frames to be
