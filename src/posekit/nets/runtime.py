@@ -19,9 +19,6 @@ if TYPE_CHECKING:
 log = logging.getLogger("posekit")
 
 RUNTIMES = ("auto", "openvino", "torch")
-import os as _os
-
-BF16 = bool(_os.environ.get("PK_BF16"))
 STREAMS = 4  # pairs that are compared at the same time, at most
 
 
@@ -93,12 +90,12 @@ class Runtime:
             from posekit.nets.pytorch import NetworkPredictor
 
             return NetworkPredictor(self.networks)
-        from posekit.nets.openvino import OpenVinoPredictor
+        from posekit.nets.openvino import OpenVinoPredictor, has_bfloat16
 
         def svnet() -> Any:
             return self.networks.svnet
 
-        return OpenVinoPredictor(svnet, self.digest, self.size, bfloat16=BF16, threads=count, streams=streams)
+        return OpenVinoPredictor(svnet, self.digest, self.size, bfloat16=has_bfloat16(), threads=count, streams=streams)
 
 
 def _has_openvino() -> bool:

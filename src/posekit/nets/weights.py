@@ -24,6 +24,14 @@ from posekit.nets.paper import Branch, PaperMVNet, PaperSVNet
 
 SHARED = ("branch.", "tower.")  # what MV-Net has from SV-Net
 
+    def __post_init__(self) -> None:
+        """Raises ConfigError where no network can be made of it."""
+        numbers = (*self.size, self.views)
+        if len(self.size) != 2 or any(type(n) is not int or not 1 <= n <= _LONGEST_SIDE for n in numbers):
+            raise ConfigError(f"paper: size and views are whole numbers from 1 to {_LONGEST_SIDE}, not {self}.")
+        if isinstance(self.width, bool) or not 0 < self.width <= _WIDEST:
+            raise ConfigError(f"paper: width is above 0 and at most {_WIDEST}, not {self.width}.")
+
 
 @dataclass(frozen=True, eq=False)
 class Networks:
@@ -125,7 +133,9 @@ def _built(preset: str, config: LiteConfig | PaperConfig, state: Mapping[str, Te
         if parameters != stored:
             raise ValueError(f"its networks have {parameters} numbers, the file {stored}")
         return networks
-    except (TypeError, ValueError, IndexError, AttributeError, OverflowError, ZeroDivisionError, RuntimeError) as error:
+    except (
+        ConfigError, TypeError, ValueError, IndexError, AttributeError, OverflowError, ZeroDivisionError, RuntimeError
+    ) as error:  # fmt: skip
         first = str(error).partition("\n")[0]
         raise WeightsError(f"the configuration of the weights {file} makes no networks ({first}).") from error
 
