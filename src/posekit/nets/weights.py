@@ -15,7 +15,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
-from posekit.errors import WeightsError
+from posekit.errors import ConfigError, WeightsError
 from posekit.io.files import write_bytes_atomic, write_text_atomic
 from posekit.nets.config import PRESETS, LiteConfig, PaperConfig, WeightsFile
 from posekit.nets.lite import LiteSVNet
@@ -23,14 +23,6 @@ from posekit.nets.mvnet import MatchingMVNet
 from posekit.nets.paper import Branch, PaperMVNet, PaperSVNet
 
 SHARED = ("branch.", "tower.")  # what MV-Net has from SV-Net
-
-    def __post_init__(self) -> None:
-        """Raises ConfigError where no network can be made of it."""
-        numbers = (*self.size, self.views)
-        if len(self.size) != 2 or any(type(n) is not int or not 1 <= n <= _LONGEST_SIDE for n in numbers):
-            raise ConfigError(f"paper: size and views are whole numbers from 1 to {_LONGEST_SIDE}, not {self}.")
-        if isinstance(self.width, bool) or not 0 < self.width <= _WIDEST:
-            raise ConfigError(f"paper: width is above 0 and at most {_WIDEST}, not {self.width}.")
 
 
 @dataclass(frozen=True, eq=False)
