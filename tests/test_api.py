@@ -13,6 +13,7 @@ import pytest
 
 from posekit import Camera, EstimateOptions, PoseEstimator, Result, api, estimate
 from posekit.errors import ImageError, PromptError
+from posekit.mesh.model import ObjectModel
 from posekit.nets.weights import build, save_networks
 from posekit.render import Renderer
 from posekit.synth.example import Example, make_example, ply
@@ -37,7 +38,8 @@ def folder(example: Example, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def estimator(example: Example, folder: Path) -> PoseEstimator:
     options = EstimateOptions(hypotheses=1, iterations=1)
-    return PoseEstimator(example.model, weights=folder / "untrained", options=options)
+    model = ObjectModel.load(folder / "toy.ply", units="m")
+    return PoseEstimator(model, weights=folder / "untrained", options=options)
 
 
 @pytest.fixture(scope="module")

@@ -30,7 +30,12 @@ CAMERA = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
 
 @pytest.fixture(scope="module")
 def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cache")
+    """A user's cache with the converted network."""
+    cache = tmp_path_factory.mktemp("cache")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(cache))
+        _ = Runtime(runtime="openvino").predictor
+    return cache
 
 
 def test_both_runtimes_answer_alike_and_the_conversion_is_kept(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import cv2
@@ -91,8 +92,8 @@ class FeatureModel:
         if kept is not None:
             return kept
         raw, points, tips, directions, plain = _extracted(model, renderer)
-        arrays = {"raw": raw, "points": points, "tips": tips, "directions": directions}
-        keep_arrays(file, {**arrays, "plain": np.asarray(plain)})
+        arrays: dict[str, NDArray[Any]] = {"raw": raw, "points": points, "tips": tips, "directions": directions}
+        keep_arrays(file, arrays | {"plain": np.asarray(plain)})
         return _decoded(raw, points, tips, directions, plain)
 
 

@@ -100,7 +100,9 @@ class WeightsFile:
         if head.get("preset") != preset:
             raise WeightsError(f"{file} holds weights of preset {head.get('preset')!r}, not {preset!r}.")
         if digest != head.get("sha256_16"):
-            raise WeightsError(f"{file} and {about_file.name} do not belong together (hash {digest}). Fetch them anew.")
+            raise WeightsError(
+                f"{file} is damaged, or not the one of {about_file.name} (hash {digest}). Fetch both anew."
+            )
         try:
             config = _config(preset, head.get("config", {}))
         except (ConfigError, TypeError, ValueError, AttributeError) as error:

@@ -10,7 +10,6 @@ import shutil
 import tempfile
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -85,12 +84,13 @@ def _converted(svnet: Callable[[], LiteSVNet], digest: str) -> Any:
     kept = user_cache("openvino") / f"{digest}-{__version__}-{openvino.__version__.split('-')[0]}"
     if digest == "untrained":
         return _convert(svnet())
-    if (kept / "svnet.xml").is_file():
-        return openvino.Core().read_model(kept / "svnet.xml")
-    model = _convert(svnet())
-    with suppress(OSError):  # a cache that cannot be written costs time only
-        _keep(model, kept)
-    return model
+    if not (kept / "svnet.xml").is_file():
+        model = _convert(svnet())
+        try:
+            _keep(model, kept)
+        except OSError:  # a cache that cannot be written costs time only
+            return model
+    return openvino.Core().read_model(kept / "svnet.xml")  # the first time too: its rounding differs a little
 
 
 def _convert(svnet: LiteSVNet) -> Any:

@@ -81,7 +81,8 @@ class Runtime:
     @cached_property
     def predictor(self) -> Predictor:
         """SV-Net for batches of pairs."""
-        return self.predictor_for(min(STREAMS, threads() or usable_cores()), threads())
+        streams = min(STREAMS, threads() or usable_cores())
+        return self.predictor_for(streams, streams)  # a thread for each: sums do not depend on the number of threads
 
     def predictor_for(self, streams: int, count: int | None) -> Predictor:
         """SV-Net with so many pairs at the same time and threads in all (None: those of the process). PyTorch has no
