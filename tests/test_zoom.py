@@ -68,6 +68,19 @@ def test_a_square_window_has_a_boxs_area() -> None:
     assert zoom.camera.size == (96, 96)
 
 
+def test_a_square_window_far_from_the_middle_has_a_boxs_area_too() -> None:
+    box = (560.0, 400.0, 639.0, 470.0)
+    wide = Camera(300.0, 300.0, 319.5, 239.5, 640, 480)
+    zoom = box_window(wide, box, 96, 0.4)
+    width, height = np.ptp(zoom.camera.project(wide.box_corner_rays(box) @ zoom.R_view_cam.T), axis=0)
+    assert np.sqrt(width * height) == pytest.approx(0.4 * 96)
+
+
+def test_a_boxs_window_is_not_enlarged_unless_asked() -> None:
+    box = (100.0, 80.0, 180.0, 120.0)
+    assert zoom_to_box(CAMERA, box, (160, 120)).camera == zoom_to_box(CAMERA, box, (160, 120), enlarge=1.0).camera
+
+
 def test_the_frontal_view_fills_its_camera() -> None:
     camera, distance = frontal_camera(MODEL, (160, 120))
     assert distance == pytest.approx(5 * MODEL.diameter) and camera.size == (160, 120)
