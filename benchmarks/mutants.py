@@ -27,8 +27,8 @@ import types
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2  # noqa: F401 - what tests import is loaded once, before the forks
-import moderngl  # noqa: F401
+import cv2
+import moderngl  # noqa: F401 - what tests import is loaded once, before the forks
 import numpy as np  # noqa: F401
 import PIL.Image
 import pycocotools.cocoeval  # noqa: F401
@@ -212,6 +212,7 @@ def main() -> None:
     for path in ("src", "tests"):
         sys.path.insert(0, str(HERE / path))
     torch.set_num_threads(1)
+    cv2.setNumThreads(1)
     PIL.Image.init()
     # a failing example need not be made smaller; the profiles of the tests start from this one
     settings.register_profile("mutants", phases=[Phase.explicit, Phase.generate], database=None)
