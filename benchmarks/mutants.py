@@ -36,6 +36,7 @@ import pytest
 import scipy.spatial  # noqa: F401
 import torch
 import trimesh  # noqa: F401
+from _pytest.main import pytest_runtestloop
 from hypothesis import Phase, settings
 
 HERE = Path(__file__).resolve().parent.parent
@@ -123,37 +124,58 @@ def _told(module: str, line: int, text: str) -> str:
     return f"lives: {module}:{line}: {text}"
 
 
-def killed(path: Path, tree: ast.Module, tests: list[str], seconds: float) -> bool:
-    """Whether the tests fail with a module's mutant."""
-    child = os.fork()
-    if child == 0:
-        _run(path, tree, tests)
-    until = time.monotonic() + seconds
-    while time.monotonic() < until:
-        done, status = os.waitpid(child, os.WNOHANG)
-        if done:
-            return os.waitstatus_to_exitcode(status) != 0
-        time.sleep(0.02)
-    os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    return True
+class Mutation:
+    """A pytest plugin that runs the collected tests once as they are and then once for every mutant, each in a process
+    forked after the collection, so that a mutant costs its tests alone. lost: how many were killed; None where the
+    tests fail without a mutant."""
+
+    def __init__(self, module: str, chosen: list[tuple[int, str, ast.Module]], seconds: float) -> None:
+        self.module, self.chosen, self.seconds = module, chosen, seconds
+        self.path = HERE / "src/posekit" / f"{module}.py"
+        self.lost: int | None = None
+
+    def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        # what renders does not survive a fork: where tests render, all of it happens in the children
+        if self._killed(session, None) if self.module in RENDERED else _fails(session):
+            return True
+        self.lost = 0
+        for line, text, mutant in self.chosen:
+            if self._killed(session, mutant):
+                self.lost += 1
+            else:
+                os.write(1, f"{_told(self.module, line, text)}\n".encode())
+        return True
+
+    def _killed(self, session: pytest.Session, mutant: ast.Module | None) -> bool:
+        child = os.fork()
+        if child == 0:
+            code = 1
+            with contextlib.suppress(BaseException):
+                if mutant is None or _exchanged(self.path, mutant):
+                    code = _fails(session)
+                else:
+                    _import_mutant(self.path, mutant)
+                    code = int(pytest.main(_options(self.module)))
+            os._exit(code)
+        until = time.monotonic() + self.seconds
+        while time.monotonic() < until:
+            done, status = os.waitpid(child, os.WNOHANG)
+            if done:
+                return os.waitstatus_to_exitcode(status) != 0
+            time.sleep(0.02)
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        return True
 
 
-def _run(path: Path, tree: ast.Module, tests: list[str]) -> None:
-    """Run the tests of a mutant in this process, and leave it."""
-    code = 1
-    with contextlib.suppress(BaseException):
-        if not _exchanged(path, tree):
-            _import_mutant(path, tree)
-        code = _pytest(tests)
-    os._exit(code)
+def _fails(session: pytest.Session) -> bool:
+    with contextlib.suppress(session.Failed):
+        pytest_runtestloop(session)
+    return bool(session.testsfailed)
 
 
-def _pytest(tests: list[str]) -> int:
-    os.chdir(HERE)
-    files = [f"tests/{name}.py" for name in tests]
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-        return int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", *files]))
+def _options(module: str) -> list[str]:
+    return ["-x", "-q", "--tb=no", "-p", "no:cacheprovider", *(f"tests/{name}.py" for name in MODULES[module])]
 
 
 def _exchanged(path: Path, tree: ast.Module) -> bool:
@@ -213,9 +235,10 @@ def main() -> None:
         sys.path.insert(0, str(HERE / path))
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
+    os.chdir(HERE)
     PIL.Image.init()
     # a failing example need not be made smaller; the profiles of the tests start from this one
-    settings.register_profile("mutants", phases=[Phase.explicit, Phase.generate], database=None)
+    settings.register_profile("mutants", phases=[Phase.explicit, Phase.generate], database=None, deadline=None)
     settings.load_profile("mutants")
     former = set(args.among.read_text().splitlines()) if args.among else None
     total = dead = 0
@@ -236,35 +259,20 @@ def _chosen(module: str, count: int, seed: int, former: set[str] | None) -> list
 
 
 def _killed_of(module: str, chosen: list[tuple[int, str, ast.Module]], seconds: float) -> int:
-    """How many of a module's mutants are killed, counted in a process that has run its tests once, so that all is
-    imported. A context that renders does not survive a fork: tests with one are imported anew for each mutant."""
-    path, tests = HERE / "src/posekit" / f"{module}.py", MODULES[module]
+    """How many of a module's mutants are killed, counted in a process of its own."""
     receiver, sender = multiprocessing.Pipe(duplex=False)
     child = os.fork()
     if child == 0:
-        with contextlib.suppress(BaseException):
-            fails = killed(path, ast.parse(path.read_text()), tests, 600) if module in RENDERED else _pytest(tests)
-            sender.send(None if fails else _count(module, path, chosen, seconds))
+        mutation = Mutation(module, chosen, seconds)
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(BaseException):
+            pytest.main(["-s", *_options(module)], plugins=[mutation])
+        sender.send(mutation.lost)
         os._exit(0)
-    sender.close()
-    try:
-        lost: int | None = receiver.recv()
-    except EOFError:
-        lost = None
+    lost = receiver.recv()
     os.waitpid(child, 0)
     if lost is None:
         raise SystemExit(f"the tests of {module} fail without a mutant.")
-    return lost
-
-
-def _count(module: str, path: Path, chosen: list[tuple[int, str, ast.Module]], seconds: float) -> int:
-    lost = 0
-    for line, text, mutant in chosen:
-        if killed(path, mutant, MODULES[module], seconds):
-            lost += 1
-        else:
-            print(_told(module, line, text), flush=True)
-    return lost
+    return int(lost)
 
 
 if __name__ == "__main__":
