@@ -135,8 +135,8 @@ def test_a_tint_is_smoothed_where_seen_and_the_median_elsewhere() -> None:
     np.testing.assert_allclose(tint.apart[seen], cv2.GaussianBlur(apart, (0, 0), 1.0)[seen])
     np.testing.assert_allclose(tint.apart[~seen], np.median(apart[seen], axis=0) + np.zeros((int((~seen).sum()), 3)))
     assert not Tint.of(apart, np.zeros((HEIGHT, WIDTH), bool)).apart.any()
-    mixed = Tint(np.full((2, 2, 3), 1.0, np.float32)).mixed(Tint(np.full((2, 2, 3), 3.0, np.float32)), 0.25)
-    np.testing.assert_allclose(mixed.apart, 1.5)
+    mixed = Tint(np.full((2, 2, 3), 2.0, np.float32)).mixed(Tint(np.full((2, 2, 3), 4.0, np.float32)), 0.25)
+    np.testing.assert_allclose(mixed.apart, 2.5)
 
 
 def test_what_is_suddenly_further_from_the_mesh_hides_it() -> None:
@@ -145,11 +145,12 @@ def test_what_is_suddenly_further_from_the_mesh_hides_it() -> None:
     now[50:60, 70:80] += np.float32([0.08, -0.08, 0.06])  # 0.128 away
     now[65:75, 70:80] += np.float32([0.08, -0.05, 0.06])  # 0.112 away
     now[60, 95] += 1  # a single pixel
+    now[80:83, 75:85] += 1  # three pixels thin
     now[5:15, 5:15] += 1  # not on the object
     wanted = np.zeros((HEIGHT, WIDTH), bool)
-    wanted[50:60, 70:80] = True
+    wanted[50:60, 70:80] = wanted[80:83, 75:85] = True
     found = usual.hides(now, silhouette)
-    assert not (found & ~wanted).any() and found[51:59, 71:79].all()
+    assert not (found & ~wanted).any() and found[51:59, 71:79].all() and found[81, 76:84].all()
 
 
 # --- outlines --------------------------------------------------------------------------------------------------------

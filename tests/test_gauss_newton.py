@@ -126,6 +126,22 @@ def test_the_loop_ends_when_turn_and_shift_are_still(k: int, sign: float) -> Non
     assert scripted(1.02 * limit * np.eye(6)[k], np.zeros(6), np.zeros(6))[1] == 2
 
 
+def test_the_turn_that_ends_the_loop_does_not_depend_on_the_distance() -> None:
+    far = Pose(POSE.R, np.array([0.1, 0.2, 3.0]))
+    for right, calls in (([1.1e-3, 0, 0, 0, 0, 0], 2), ([0, 0, 0, 2.8e-3, 0, 0], 1), ([0, 0, 0, 0, 3.2e-3, 0], 2)):
+        assert scripted(right, np.zeros(6), np.zeros(6), start=far)[1] == calls
+
+
+def test_a_lines_side_does_not_matter() -> None:
+    """Also where all residuals are large: then their median widens the knee."""
+    for shift in (-20.0, 20.0):
+        one = Lines(POINTS, PIXELS + shift * NORMALS, NORMALS, SIGMA)
+        for a, b in zip(
+            one.equations(POSE, CAMERA), replace(one, normals=-NORMALS).equations(POSE, CAMERA), strict=True
+        ):
+            np.testing.assert_allclose(a, b, rtol=1e-9)
+
+
 @pytest.mark.parametrize("right", [None, [0, 0, 0, 0, 0, -0.5995], [0, 0, 0, np.nan, 0, 0], [0, 0, 0, 0, 0, -5]])
 def test_a_pose_that_cannot_be_ends_the_loop(right: object) -> None:
     found, calls = scripted(right, np.full(6, 0.01))
