@@ -46,6 +46,16 @@ def test_many_poses_at_once() -> None:
         assert many[3] == pytest.approx(one)
 
 
+def test_translation_errors_of_many_poses() -> None:
+    estimated, truth = random_poses(5, 7), random_poses(5, 8)
+    wanted = [np.linalg.norm(e.t - t.t) for e, t in zip(estimated, truth, strict=True)]
+    np.testing.assert_allclose(metrics.translation_error(estimated, truth), wanted)
+    symmetries = Symmetries.parse("z:3", [0.02, 0.0, 0.0]).transforms()
+    alone = [metrics.translation_error(e, t, symmetries) for e, t in zip(estimated, truth, strict=True)]
+    np.testing.assert_allclose(metrics.translation_error(estimated, truth, symmetries), alone)
+    assert not np.allclose(alone, wanted)
+
+
 def test_an_array_of_another_shape_is_refused() -> None:
     with pytest.raises(ValueError, match=r"shape \(4, 4\) or \(N, 4, 4\), not \(3, 3\)"):
         metrics.rotation_error(np.eye(3), GT)
