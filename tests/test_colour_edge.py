@@ -127,6 +127,14 @@ def test_chromaticities_are_shares_of_brightness() -> None:
     assert edge.like_mesh(near, view).all()
 
 
+def test_chromaticities_are_smoothed_along_both_axes() -> None:
+    speck = np.full((31, 31, 3), 60, np.uint8)
+    speck[15, 15] = 255, 60, 60
+    found = edge.chromaticity(speck)[..., 0]
+    np.testing.assert_allclose(found, found.T, atol=1e-6)
+    assert found[15, 15] > found[15, 16] > found[15, 17] > found[15, 22] == pytest.approx(1 / 3)
+
+
 def test_a_tint_is_smoothed_where_seen_and_the_median_elsewhere() -> None:
     rng = np.random.default_rng(0)
     apart = rng.normal(size=(HEIGHT, WIDTH, 3)).astype(np.float32)
