@@ -6,11 +6,21 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from posekit.geometry import Pose, so3_exp
 
 Array = NDArray[np.float64]
+
+settings.register_profile("posekit", deadline=None, max_examples=60, derandomize=True)
+settings.load_profile("posekit")
+
+# of hypothesis: (N, 3), before a camera
+points = st.lists(st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(0.4, 3)), min_size=1, max_size=8).map(
+    np.array
+)
 
 
 def moved(pose: Pose, step: Array) -> Pose:

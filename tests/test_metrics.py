@@ -46,6 +46,16 @@ def test_many_poses_at_once() -> None:
         assert many[3] == pytest.approx(one)
 
 
+def test_translation_errors_of_many_poses() -> None:
+    estimated, truth = random_poses(5, 7), random_poses(5, 8)
+    wanted = [np.linalg.norm(e.t - t.t) for e, t in zip(estimated, truth, strict=True)]
+    np.testing.assert_allclose(metrics.translation_error(estimated, truth), wanted)
+    symmetries = Symmetries.parse("z:3", [0.02, 0.0, 0.0]).transforms()
+    alone = [metrics.translation_error(e, t, symmetries) for e, t in zip(estimated, truth, strict=True)]
+    np.testing.assert_allclose(metrics.translation_error(estimated, truth, symmetries), alone)
+    assert not np.allclose(alone, wanted)
+
+
 def test_an_array_of_another_shape_is_refused() -> None:
     with pytest.raises(ValueError, match=r"shape \(4, 4\) or \(N, 4, 4\), not \(3, 3\)"):
         metrics.rotation_error(np.eye(3), GT)
@@ -74,6 +84,14 @@ def test_deepim_flips_beyond_a_right_angle_only() -> None:
     assert metrics.deepim_rotation_error(turned(np.deg2rad(80)), GT) == pytest.approx(np.deg2rad(80))
     both = metrics.deepim_rotation_error([turned(np.deg2rad(100)), turned(np.deg2rad(30))], GT)
     np.testing.assert_allclose(np.rad2deg(both), [80, 30])
+
+
+def test_deepim_flips_about_the_objects_own_z_axis() -> None:
+    tilt = so3_exp([0.2, -0.3, 0.1])
+    flipped = GT @ Pose.rotation(so3_exp([0, 0, np.pi])) @ Pose.rotation(tilt)
+    back = Pose.rotation(tilt) @ Pose.rotation(so3_exp([0, 0, np.pi]))
+    wanted = metrics.rotation_error(GT @ Pose.rotation(so3_exp([0, 0, np.pi])) @ back, GT)
+    assert metrics.deepim_rotation_error(flipped, GT) == pytest.approx(wanted)
 
 
 def test_within_is_strict() -> None:
@@ -215,6 +233,30 @@ def test_vsd_leaves_out_what_is_hidden() -> None:
     np.testing.assert_allclose(metrics.vsd(depths(), depths(), scene, FAR, 0.1, TAUS), 1.0)
 
 
+def test_vsd_against_its_definition() -> None:
+    """Pixel by pixel, with a wide lens, holes in the sensor's depth, and distances along the rays."""
+    rng, camera = np.random.default_rng(0), Camera(6.0, 7.0, 5.5, 3.5, 12, 8)
+    est, gt, scene = (rng.uniform(0.50, 0.56, (8, 12)) * (rng.random((8, 12)) < 0.7) for _ in range(3))
+    taus = [0.05, 0.2, 0.4]
+    for delta in (0.015, 0.03):
+        costs = np.zeros((3, 0))
+        for row in range(8):
+            for column in range(12):
+                length = float(np.linalg.norm([(column - 5.5) / 6, (row - 3.5) / 7, 1]))
+                e, g, s = (d[row, column] * length for d in (est, gt, scene))
+                seen_g = g > 0 and (s == 0 or g - s <= delta)
+                seen_e = e > 0 and (s == 0 or e - s <= delta or seen_g)
+                if seen_e and seen_g:
+                    costs = np.column_stack([costs, [abs(e - g) / 0.1 >= tau for tau in taus]])
+                elif seen_e or seen_g:
+                    costs = np.column_stack([costs, np.ones(3)])
+        found = metrics.vsd(est, gt, scene, camera, 0.1, taus, delta)
+        np.testing.assert_allclose(found, costs.mean(axis=1))
+        assert 0.2 < found[2] < found[0] < 1
+        if delta == 0.015:
+            np.testing.assert_array_equal(metrics.vsd(est, gt, scene, camera, 0.1, taus), found)
+
+
 # --- matching, precision ---------------------------------------------------------------------------------------------
 
 
@@ -231,6 +273,58 @@ def test_average_precision_of_hand_made_cases() -> None:
     assert metrics.average_precision([], [], 3) == 0.0
     # right, wrong, right of 2: precision 1 up to recall 0.5 (51 of the levels), 2/3 beyond (50)
     assert metrics.average_precision([True, True, False], [0.9, 0.7, 0.8], 2) == pytest.approx((51 + 50 * 2 / 3) / 101)
+
+
+def test_precision_is_read_at_a_hundred_and_one_levels_of_recall() -> None:
+    rng = np.random.default_rng(1)
+    hits, scores, total = rng.random(60) < 0.5, rng.random(60), 40
+    order = np.argsort(-scores)
+    precision = np.cumsum(hits[order]) / np.arange(1, 61)
+    recall = np.cumsum(hits[order]) / total
+    wanted = [max((p for p, r in zip(precision, recall, strict=True) if r >= k / 100), default=0) for k in range(101)]
+    assert metrics.average_precision(hits, scores, total) == pytest.approx(np.mean(wanted))
+
+
+def test_scores_that_are_alike_keep_their_order() -> None:
+    assert metrics.match([[1.0], [0.5]], [0.5, 0.5], 2.0).tolist() == [0, -1]
+    assert metrics.average_precision([False] + [True] * 20, [0.5] * 21, 20) < 1
+
+
+def test_coco_counts_a_hundred_detections_of_a_picture_and_a_full_overlap() -> None:
+    truth = [metrics.Regions(np.zeros(0), np.zeros(1, bool))]
+    scores = np.linspace(1, 0, 101)
+    for place, wanted in ((99, 1 / 100), (100, 0.0)):
+        overlap = np.zeros((101, 1))
+        overlap[place] = 1.0
+        found = [metrics.Regions(scores, np.zeros(0, bool))]
+        assert metrics.coco_ap(truth, found, [overlap], (0.5,)) == pytest.approx(wanted)
+    one = [metrics.Regions(np.ones(1), np.zeros(0, bool))]
+    for overlap, right in ((1.0, 1.0), (1 - 1e-11, 1.0), (1 - 1e-9, 0.0)):
+        assert metrics.coco_ap(truth, one, [np.array([[overlap]])], (1.0,)) == right
+    assert metrics.coco_ap(truth, one, [np.array([[0.75]])]) == pytest.approx(0.6), "0.50 to 0.75 of ten thresholds"
+
+
+def test_a_detection_takes_the_truth_with_the_most_overlap_and_a_real_one_first() -> None:
+    truths = [metrics.Regions(np.zeros(0), np.array([False, False, True]))]
+    found = [metrics.Regions(np.array([0.9, 0.8]), np.zeros(0, bool))]
+    both = np.array([[0.6, 0.7, 0.9], [0.2, 0.65, 0.1]])  # the first takes the second truth; nothing is left
+    assert metrics.coco_ap(truths, found, [both], (0.5,)) == pytest.approx(51 / 101)
+    both[1] = 0.65, 0.1, 0.1
+    assert metrics.coco_ap(truths, found, [both], (0.5,)) == 1.0
+    ignored = np.array([[0.1, 0.1, 0.9], [0.1, 0.1, 0.8]])  # the ignored truth is taken once, the second counts
+    assert metrics.coco_ap(truths, found, [ignored], (0.5,)) == 0.0
+
+
+def test_the_overlap_of_boxes_without_an_area_is_zero() -> None:
+    assert metrics.box_iou([[1, 1, 1, 1]], [[1, 1, 1, 1], [0, 0, 2, 2]]).tolist() == [[0, 0]]
+    rng = np.random.default_rng(0)
+    boxes = rng.integers(0, 8, (30, 2))
+    boxes = np.hstack([boxes, boxes + rng.integers(1, 6, (30, 2))])
+    iou = metrics.box_iou(boxes, boxes)
+    for a, row in zip(boxes, iou, strict=True):
+        for b, found in zip(boxes, row, strict=True):
+            cells = [{(x, y) for x in range(c[0], c[2]) for y in range(c[1], c[3])} for c in (a, b)]
+            assert found == pytest.approx(len(cells[0] & cells[1]) / len(cells[0] | cells[1]))
 
 
 def test_box_iou() -> None:
