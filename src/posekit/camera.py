@@ -56,6 +56,7 @@ class Camera:
 
     @property
     def K(self) -> Array:
+        """The intrinsic matrix (3, 3), pixels; float64."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
 
     @property

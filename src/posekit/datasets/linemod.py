@@ -113,6 +113,7 @@ class LinemodDataset(BopDataset):
 
     @cached_property
     def frames(self) -> _Split:
+        """Which frames of each object are the test; where no list says so, the annotated rotations do."""
         frames, rotations = {}, {}
         for scene in self._kept:
             poses = {}
@@ -126,20 +127,25 @@ class LinemodDataset(BopDataset):
 
     @property
     def split_label(self) -> str:
+        """Where the split comes from, for a person."""
         return self.frames.label
 
     @property
     def split_hash(self) -> str:
+        """16 hexadecimal digits that name the split."""
         return self.frames.digest
 
     def scenes(self) -> list[int]:
+        """Numbers of the scenes, each that of its object."""
         return self._kept
 
     def images(self, scene: int | None = None) -> list[tuple[int, int]]:
+        """(scene, image) of the test's frames, of one scene or of all."""
         scenes = self._kept if scene is None else [scene]
         return [(s, image) for s in scenes for image in self.frames.test[s]]
 
     def instances(self, scene: int, image: int, every: bool = False) -> list[Instance]:
+        """The scene's own object in a picture; every: all that are annotated. Poses ``T_cam_obj`` in metres."""
         found = super().instances(scene, image, every)
         return found if every else [i for i in found if i.obj_id == scene]
 
@@ -170,6 +176,7 @@ class DeepimDataset:
 
     @cached_property
     def frames(self) -> _Split:
+        """Which frames of each object are the test; where no list says so, the annotated rotations do."""
         numbers = {
             o: sorted(int(p.name.split("-")[0]) for p in (self._observed / f"{o:02d}").glob("*-color.png"))
             for o in self._kept
@@ -179,13 +186,16 @@ class DeepimDataset:
 
     @property
     def split_label(self) -> str:
+        """Where the split comes from, for a person."""
         return self.frames.label
 
     @property
     def split_hash(self) -> str:
+        """16 hexadecimal digits that name the split."""
         return self.frames.digest
 
     def model_ids(self) -> list[int]:
+        """Numbers of the objects that this copy has."""
         return self._kept
 
     def model(self, obj_id: int) -> ObjectModel:
@@ -202,31 +212,39 @@ class DeepimDataset:
         return self._loaded[obj_id]
 
     def measured_model(self, obj_id: int) -> MeasuredModel:
+        """The object with its mesh's own diameter, metres. Raises MeshError where there is no mesh."""
         model = self.model(obj_id)
         return MeasuredModel(model, model.diameter)
 
     def scenes(self) -> list[int]:
+        """Numbers of the scenes, each that of its object."""
         return self._kept
 
     def images(self, scene: int | None = None) -> list[tuple[int, int]]:
+        """(scene, image) of the test's frames, of one scene or of all."""
         scenes = self._kept if scene is None else [scene]
         return [(s, image) for s in scenes for image in self.frames.test[s]]
 
     def view(self, scene: int, image: int) -> View:
+        """A frame with LINEMOD's camera. Raises ImageError where the picture is missing or damaged."""
         pixels = load_image(self.image_path(scene, image))
         return View(pixels, self.camera(scene, image, (pixels.shape[1], pixels.shape[0])))
 
     def image_path(self, scene: int, image: int) -> Path:
+        """The file of a frame's colours."""
         return self._observed / f"{scene:02d}" / f"{image:06d}-color.png"
 
     def picture_size(self, scene: int, image: int) -> tuple[int, int]:
+        """(width, height) in pixels. Raises ImageError where the picture is missing or damaged."""
         pixels = load_image(self.image_path(scene, image))
         return pixels.shape[1], pixels.shape[0]
 
     def camera(self, _scene: int, _image: int, size: tuple[int, int]) -> Camera:
+        """LINEMOD's camera, the same for all frames; size: (width, height) in pixels."""
         return Camera.from_K(_LINEMOD_K, *size)
 
     def depth(self, scene: int, image: int) -> NDArray[np.float32] | None:
+        """float32 (H, W), metres, 0 where it was not measured; None where the copy has none. Raises ImageError."""
         path = self._observed / f"{scene:02d}" / f"{image:06d}-depth.png"
         if not path.is_file():
             return None
@@ -236,6 +254,7 @@ class DeepimDataset:
         return np.asarray(raw, dtype=np.float32) / np.float32(1000.0)
 
     def instances(self, scene: int, image: int, every: bool = False) -> list[Instance]:  # noqa: ARG002
+        """The one object of a frame, ``T_cam_obj`` in metres; ``every`` changes nothing. Raises InputError."""
         mask_path = self._observed / f"{scene:02d}" / f"{image:06d}-label.png"
         return [DeepimInstance(scene, image, 0, scene, self._pose(scene, image), None, None, np.nan, mask_path)]
 
@@ -257,6 +276,7 @@ class DeepimInstance(Instance):
     """An instance whose mask is a label picture: the object's pixels hold its number."""
 
     def mask(self) -> NDArray[np.bool_]:
+        """Its visible pixels, bool (H, W). Raises ImageError where the file is missing or damaged."""
         raw = cv2.imread(str(self.mask_path), cv2.IMREAD_UNCHANGED)
         if raw is None:
             raise ImageError(f"the label picture {self.mask_path} is missing or damaged: copy it again.")

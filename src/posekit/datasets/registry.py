@@ -40,6 +40,7 @@ class DatasetInfo:
         return self.folder or self.name
 
     def label(self, obj_id: int) -> str:
+        """An object's name, or "object N" where it has none."""
         return self.names.get(obj_id, f"object {obj_id}")
 
     def number(self, name: str) -> int:

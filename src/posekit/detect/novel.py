@@ -121,6 +121,7 @@ class AppearanceSimilarity:
         return self._known[model]
 
     def appearance(self, view: View, proposals: Sequence[Detection]) -> _Appearance:
+        """The features and colours of N proposals' crops, to be compared with each model's views."""
         crops = [self._crop(view, proposal) for proposal in proposals]
         return _Appearance(self._features(crops), _chroma(crops))
 

@@ -21,7 +21,8 @@ from posekit.view import View
 class Estimator(Protocol):
     """What a `PoseEstimator` does for the search."""
 
-    def estimate(self, view: View, detections: Sequence[Detection], min_score: float = 0.0) -> list[Estimate]: ...
+    def estimate(self, view: View, detections: Sequence[Detection], min_score: float = 0.0) -> list[Estimate]:
+        """Estimates of its model at the detections, by falling score, those of at least ``min_score``."""
 
 
 EstimatorOf = Callable[[ObjectModel], Estimator]

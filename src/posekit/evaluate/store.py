@@ -55,9 +55,11 @@ class RunFolder:
             (self.path / name).unlink(missing_ok=True)
 
     def has(self, picture: Picture) -> bool:
+        """Whether there is a record of the picture."""
         return self._file(picture).is_file()
 
     def read(self, picture: Picture) -> dict[str, Any]:
+        """A picture's record. Raises OutputError where it is missing or damaged."""
         path = self._file(picture)
         try:
             record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
@@ -66,6 +68,7 @@ class RunFolder:
         return record
 
     def write(self, picture: Picture, record: Mapping[str, Any]) -> None:
+        """Write a picture's record, whole or not at all."""
         write_text_atomic(self._file(picture), json.dumps(record))
 
     def _file(self, picture: Picture) -> Path:

@@ -20,6 +20,7 @@ class TrueMask:
     truth: Truth | None = None
 
     def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
+        """The annotated mask as the first model's detection, score 1; nothing where it is hidden or of another size."""
         if self.truth is None or self.truth.visible < 0.1:
             return []
         mask = self.truth.read_mask()

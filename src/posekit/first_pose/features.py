@@ -124,6 +124,7 @@ class FeatureSearch:
 
     @property
     def features(self) -> FeatureModel:
+        """The model's local features, computed at the first call and kept."""
         if self._features is None:
             self._features = FeatureModel.of(self.model, self.renderer)
         return self._features

@@ -75,6 +75,7 @@ class ViewBank:
         return np.rot90(self.coords[index // TURNS], index % TURNS).astype(np.float32)
 
     def template_camera(self, index: int) -> Camera:
+        """The camera that template ``index`` was rendered with, turned with its picture; square, pixels."""
         f, cx, cy = self.intrinsics[index // TURNS]
         for _ in range(index % TURNS):
             cx, cy = cy, VIEW - 1 - cx

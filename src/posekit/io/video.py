@@ -56,10 +56,12 @@ class Frames(Protocol):
     """Frames one after the other. count: how many there are, where that is known before. rate: frames a second."""
 
     @property
-    def count(self) -> int | None: ...
+    def count(self) -> int | None:
+        """How many frames there are; None where that is not known before."""
 
     @property
-    def rate(self) -> float: ...
+    def rate(self) -> float:
+        """Frames a second."""
 
     def __iter__(self) -> Iterator[Frame]: ...
 

@@ -65,6 +65,7 @@ def coincident(vertices: Floats) -> NDArray[np.int64]:
 
 
 def face_areas(vertices: Floats, faces: NDArray[Any]) -> Floats:
+    """Areas (F,) of faces (F, 3) of vertices (V, 3), in the vertices' unit squared."""
     corners = vertices[faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return np.asarray(0.5 * np.linalg.norm(cross, axis=1))

@@ -53,6 +53,7 @@ class Symmetries:
 
     @classmethod
     def none(cls) -> Symmetries:
+        """Of an object that has no symmetry."""
         return cls()
 
     @classmethod

@@ -45,10 +45,13 @@ class LiteConfig:
 
 
 def conv_bn(cin: int, cout: int, kernel: int = 3, stride: int = 1) -> nn.Sequential:
+    """A convolution that keeps the size but for its stride, and batch normalisation."""
     return nn.Sequential(nn.Conv2d(cin, cout, kernel, stride, kernel // 2, bias=False), nn.BatchNorm2d(cout))
 
 
 class Residual(nn.Module):
+    """Two 3x3 convolutions and a shortcut: (B, cin, H, W) -> (B, cout, H / stride, W / stride)."""
+
     def __init__(self, cin: int, cout: int, stride: int = 1) -> None:
         super().__init__()
         self.first = conv_bn(cin, cout, 3, stride)
@@ -56,6 +59,7 @@ class Residual(nn.Module):
         self.skip = nn.Identity() if stride == 1 and cin == cout else conv_bn(cin, cout, 1, stride)
 
     def forward(self, x: Tensor) -> Tensor:
+        """(B, cin, H, W) -> (B, cout, H / stride, W / stride), not negative."""
         return F.relu(self.second(F.relu(self.first(x))) + self.skip(x))
 
 
@@ -70,6 +74,7 @@ class Tower(nn.Module):
         self.coarse = Residual(fine, coarse, 2)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """(B, C, H, W) -> features at 1/4 and at 1/8 of the size."""
         x = F.pixel_unshuffle(x, 4).contiguous(memory_format=torch.channels_last)
         fine = self.fine(F.relu(self.stem(x)))
         return fine, self.coarse(fine)

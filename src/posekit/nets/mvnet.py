@@ -27,10 +27,12 @@ class MatchingConfig(Protocol):
     """What MV-Net needs to know of the tower: widths, its channels at 1/4 and 1/8; size, (width, height) of crops."""
 
     @property
-    def widths(self) -> tuple[int, int]: ...
+    def widths(self) -> tuple[int, int]:
+        """The tower's channels at 1/4 and 1/8."""
 
     @property
-    def size(self) -> tuple[int, int]: ...
+    def size(self) -> tuple[int, int]:
+        """(width, height) of crops, pixels."""
 
 
 class Encoded(NamedTuple):
@@ -158,6 +160,7 @@ class Code(nn.Module):
         self.fc = nn.Linear(48 * rows * columns, 128)
 
     def forward(self, x: Tensor) -> Tensor:
+        """(N, D, h, w) -> (N, 128), unit length, float32."""
         return F.normalize(self.fc(self.reduce(x).flatten(1)).float(), dim=1)
 
 

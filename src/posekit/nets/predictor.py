@@ -63,7 +63,8 @@ class Predictor(Protocol):
     size: tuple[int, int]
     dense: bool
 
-    def predict(self, observed: Sequence[View], rendered: Sequence[View]) -> list[PairPrediction]: ...
+    def predict(self, observed: Sequence[View], rendered: Sequence[View]) -> list[PairPrediction]:
+        """A prediction for each pair of an observed and a rendered crop; both lists have the same length."""
 
 
 class NetworkPredictor:
@@ -77,6 +78,7 @@ class NetworkPredictor:
         self.dense = networks.dense
 
     def predict(self, observed: Sequence[View], rendered: Sequence[View]) -> list[PairPrediction]:
+        """A prediction for each pair of crops of the network's size, in one batch."""
         svnet, device = self.networks.svnet, self.device
         dense = isinstance(svnet, LiteSVNet)
         first = np.stack([to_input(v.image, None)[:3] if dense else to_input(v.image, v.mask) for v in observed])

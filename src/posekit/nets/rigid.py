@@ -45,6 +45,7 @@ class Motion:
 
     @classmethod
     def none(cls, like: Tensor) -> Motion:
+        """The identity for each of a batch; like: (B, ...), whose device it takes."""
         B = like.shape[0]
         return cls(torch.eye(3, device=like.device).expand(B, 3, 3), torch.zeros(B, 3, device=like.device))
 

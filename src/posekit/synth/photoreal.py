@@ -157,6 +157,7 @@ class Photoreal:
         self.meshes = {obj_id: _mesh_data(model) for obj_id, model in self.models}
 
     def block(self, number: int, places: Sequence[int]) -> Iterator[tuple[int, Picture]]:
+        """(place, picture) for each place: views of room ``number``, path-traced."""
         room = self._room(np.random.default_rng([self.config.seed, 0, number]))
         scene = self.mi.load_dict(room.scene)
         for place in places:

@@ -62,6 +62,7 @@ class Sequences:
         self.clutter = Clutter(config.seed)
 
     def block(self, number: int, places: Sequence[int]) -> Iterator[tuple[int, Picture]]:
+        """(place, picture) for each place: frames of sequence ``number``."""
         take = self._take(MOTIONS[motion_of(self.config.motion, number)],
                           np.random.default_rng([self.config.seed, 0, number]))  # fmt: skip
         for place in places:

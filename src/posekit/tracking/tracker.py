@@ -51,7 +51,8 @@ LEAST_SCALE, KNEE = 0.5, 2.5  # pixels, no correspondence is more exact; standar
 class Finder(Protocol):
     """Whatever finds objects in a photograph, such as posekit.detect's and posekit.detect.novel's detectors."""
 
-    def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]: ...
+    def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
+        """Instances of the models in the picture, by falling score."""
 
 
 @dataclass(frozen=True)
@@ -111,6 +112,7 @@ class Tracked:
 
     @property
     def T_cam_obj(self) -> Pose | None:
+        """The pose, metres; None where the object is not seen."""
         return None if self.estimate is None else self.estimate.T_cam_obj
 
     @property

@@ -46,33 +46,60 @@ class Schedule(Protocol):
     """What the loop needs to know of a training's configuration; `TrainConfig` says what each means."""
 
     @property
-    def recipe(self) -> str: ...
+    def recipe(self) -> str:
+        """What is trained: the name that checkpoints carry."""
+
     @property
-    def steps(self) -> int: ...
+    def steps(self) -> int:
+        """Steps of the whole training."""
+
     @property
-    def minutes(self) -> float: ...
+    def minutes(self) -> float:
+        """Wall-clock minutes after which it ends, if the steps have not ended it before; 0 = no limit."""
+
     @property
-    def seed(self) -> int: ...
+    def seed(self) -> int:
+        """Of all that is drawn at random."""
+
     @property
-    def validate(self) -> int: ...
+    def validate(self) -> int:
+        """Steps between validations."""
+
     @property
-    def export_seconds(self) -> float: ...
+    def export_seconds(self) -> float:
+        """Weights and a checkpoint are also written every so many seconds; 0 = not."""
+
     @property
-    def save(self) -> int: ...
+    def save(self) -> int:
+        """Steps between checkpoints."""
+
     @property
-    def log(self) -> int: ...
+    def log(self) -> int:
+        """Steps between rows of the log."""
+
     @property
-    def keep(self) -> int: ...
+    def keep(self) -> int:
+        """Checkpoints that are kept."""
+
     @property
-    def overfit(self) -> bool: ...
+    def overfit(self) -> bool:
+        """Whether every step sees the first batch."""
+
     @property
-    def profile(self) -> bool: ...
+    def profile(self) -> bool:
+        """Whether some steps are recorded by torch's profiler."""
+
     @property
-    def optimiser(self) -> OptimiserConfig: ...
+    def optimiser(self) -> OptimiserConfig:
+        """The optimiser and its rates."""
+
     @property
-    def machine(self) -> MachineConfig: ...
+    def machine(self) -> MachineConfig:
+        """What it runs on."""
+
     @property
-    def world(self) -> int: ...
+    def world(self) -> int:
+        """Processes in all."""
 
 
 class Task(Protocol):
@@ -83,10 +110,12 @@ class Task(Protocol):
     """
 
     @property
-    def nets(self) -> nn.Module: ...
+    def nets(self) -> nn.Module:
+        """The networks alone, whose weights are averaged and kept."""
 
     @property
-    def module(self) -> nn.Module: ...
+    def module(self) -> nn.Module:
+        """Has ``nets`` inside; from a batch and a seed to the loss and its parts."""
 
     def stream(self, start: int, rank: int) -> IterableDataset[Batch]:
         """Process ``rank``'s batches from number ``start`` on."""
@@ -311,6 +340,7 @@ class Trainer:
 
     @property
     def on_gpu(self) -> bool:
+        """Whether the training runs on a CUDA device without a loss scaler."""
         return bool(self.fabric.device.type == "cuda") and self.config.machine.precision != "16-mixed"
 
     def _check_finite(self, loss: float, norm: float) -> None:

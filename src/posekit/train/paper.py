@@ -70,6 +70,7 @@ class PaperModule(nn.Module):
         self._frontals: dict[int, tuple[Frontal, Tensor]] = {}
 
     def forward(self, batch: Batch, seed: int) -> tuple[Tensor, dict[str, float]]:
+        """The loss of a batch and its parts; seed: of the poses that are drawn."""
         svnet, mvnet = self.nets["svnet"], self.nets["mvnet"]
         assert isinstance(svnet, PaperSVNet) and isinstance(mvnet, PaperMVNet)
         rng = np.random.default_rng(seed)
@@ -198,11 +199,13 @@ class PaperTask(PoseTask):
         self.module: nn.Module = PaperModule(self.nets, catalogue.models, networks.size, config.paper.views)
 
     def stream(self, start: int, rank: int) -> IterableDataset[Batch]:
+        """Process ``rank``'s batches from number ``start`` on."""
         return SceneStream(self.config.stream, self.config.seed, self.catalogue, self.sources.photos, start=start,
                            rank=rank)  # fmt: skip
 
     @property
     def measured(self) -> int:
+        """Batches that `prepare` measures: none where the networks are not new."""
         return MEASURED if self.fresh else 0
 
     def prepare(self, batches: Sequence[Batch]) -> None:

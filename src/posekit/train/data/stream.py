@@ -127,6 +127,7 @@ class Source:
         self._last: tuple[tuple[int, int], ObjectModel] | None = None
 
     def rng(self, purpose: int, k: int) -> np.random.Generator:
+        """The generator of ``purpose`` and number k, the same in every run."""
         return np.random.default_rng([self.stream.seed, purpose, self.lane, self.shard, k])
 
     def object(self, purpose: int, block: int) -> ObjectModel:

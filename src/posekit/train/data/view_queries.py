@@ -194,6 +194,7 @@ class Relation:
 
     @classmethod
     def of(cls, R_query: Array, R_templates: Array, config: QueryConfig) -> Relation:
+        """From rotations ``R_cam_obj`` of a query (3, 3) and of K templates (K, 3, 3)."""
         between = R_query @ R_templates.transpose(0, 2, 1)
         turn = np.stack([between[:, 0, 0] + between[:, 1, 1], between[:, 1, 0] - between[:, 0, 1]], axis=1)
         turn /= np.linalg.norm(turn, axis=1, keepdims=True).clip(1e-9)
