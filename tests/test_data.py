@@ -18,7 +18,7 @@ from posekit.synth.appearance import KINDS, faded, variants
 from posekit.synth.procedural import random_object, random_texture
 from posekit.train.data.augment import AugmentConfig, augment, composed, disturb_mask, observe
 from posekit.train.data.crops import Frontal, SceneConfig, box_sample, render_scenes
-from posekit.train.data.pairs import Pair, PairConfig, render_pairs, stack_statistics
+from posekit.train.data.pairs import Pair, PairConfig, render_pairs
 from posekit.train.data.stream import PairStream, StreamConfig, load_photos
 from posekit.zoom import frontal_pose
 
@@ -57,8 +57,6 @@ def test_pairs_are_what_their_numbers_say(pairs: list[Pair]) -> None:
         # the source's centre is the crop's: its silhouette reaches the middle's neighbourhood on both sides
         columns = np.flatnonzero((p.source[..., 3] > 0).any(0))
         assert columns[0] < 64 < columns[-1]
-    quat, v = stack_statistics(pairs)
-    assert len(quat) == len(v) == len(pairs) - len(lost)
 
 
 def test_augmentation_keeps_the_truth(pairs: list[Pair]) -> None:

@@ -23,7 +23,7 @@ def turned(angle: float, axis: tuple[float, float, float] = (0, 0, 1)) -> Pose:
 def test_plain_errors() -> None:
     moved = Pose(turned(0.3).R, GT.t + [0.03, 0.0, 0.04])
     assert metrics.rotation_error(moved, GT) == pytest.approx(0.3)
-    assert metrics.translation_error(moved, GT) == pytest.approx(0.05)
+    assert metrics.pose_error(moved, GT)[1] == pytest.approx(0.05)
     assert f"{metrics.rotation_error(GT, GT):.3f}" == "0.000"
 
 
@@ -56,9 +56,9 @@ def test_symmetries_count_the_nearest_truth() -> None:
     symmetries = Symmetries.parse("z:2", centre).transforms()
     flipped = GT @ symmetries[1]
     assert metrics.rotation_error(flipped, GT) == pytest.approx(np.pi)
-    assert metrics.translation_error(flipped, GT) == pytest.approx(0.04)  # the axis is beside the origin
+    assert metrics.pose_error(flipped, GT)[1] == pytest.approx(0.04)  # the axis is beside the origin
     assert metrics.rotation_error(flipped, GT, symmetries) == pytest.approx(0, abs=1e-9)
-    assert metrics.translation_error(flipped, GT, symmetries) == pytest.approx(0, abs=1e-9)
+    assert metrics.pose_error(flipped, GT, symmetries)[1] == pytest.approx(0, abs=1e-9)
 
 
 def test_continuous_symmetries_are_as_fine_as_their_steps() -> None:

@@ -46,11 +46,6 @@ def rotation_error(estimated: Poses, truth: Poses, symmetries: Sequence[Pose] = 
     return pose_error(estimated, truth, symmetries)[0]
 
 
-def translation_error(estimated: Poses, truth: Poses, symmetries: Sequence[Pose] = _ALONE) -> Array:
-    """Distance of the origins, metres, to the symmetric truth with the nearest rotation."""
-    return pose_error(estimated, truth, symmetries)[1]
-
-
 def deepim_rotation_error(estimated: Poses, truth: Poses) -> Array:
     """DeepIM's rotation error of LINEMOD's eggbox, radians: an estimate that is more than 90 degrees off is turned by
     180 degrees about the object's z axis. The translation error stays as it is."""

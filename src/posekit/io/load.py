@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from posekit.camera import Box, Camera
-from posekit.errors import CameraError, ImageError, InputError, PromptError
+from posekit.errors import ImageError, InputError, PromptError
 from posekit.geometry import Pose, nearest_rotation
 from posekit.io.calibration import Calibration, load_calibration
 from posekit.io.limits import limit
@@ -280,21 +280,6 @@ def _positive(value: Any) -> float:
     except (TypeError, ValueError, ZeroDivisionError):
         return 0.0
     return number if math.isfinite(number) and number > 0 else 0.0
-
-
-def load_camera(source: str | Path, size: Size, image: str | Path | None = None) -> Camera:
-    """The camera of a picture of ``size`` (width, height), as `load_calibration` finds it.
-
-    Raises CameraError, also where it has lens distortion: a Camera has none, so load_view undistorts the picture too.
-    """
-    found = load_calibration(source, size, image)
-    if found.lens is not None:
-        raise CameraError(
-            f"{source} has lens distortion ({', '.join(f'{v:g}' for v in found.lens.coefficients)}), which a Camera "
-            "has not: load the photograph with posekit.io.load.load_view, or take the camera and the lens from "
-            "posekit.io.calibration.load_calibration."
-        )
-    return found.camera
 
 
 # --- poses ------------------------------------------------------------------------------------------------------

@@ -28,7 +28,6 @@ from posekit.synth.plan import SynthConfig
 from posekit.synth.procedural import noise_image, random_colour
 
 OBJECTS = (3, 8)  # on a table, at most as many as there are
-CPU_VARIANTS = ("llvm_ad_rgb", "scalar_rgb")
 LIBLLVM = (20, 19, 18, 17, 16)  # versions that work; 15 does not
 DEPTH_OF_PATHS = 6
 MI_CAM = np.diag([-1.0, -1.0, 1.0, 1.0])  # Mitsuba's camera looks along z with x left and y up

@@ -182,9 +182,3 @@ def true_flow(
 
 def _rgba(image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
     return np.dstack([image, mask.astype(np.uint8) * 255])
-
-
-def stack_statistics(pairs: Sequence[Pair]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """quat_wxyz (N, 4) and v (N, 3) of the pairs that are not lost."""
-    kept = [p for p in pairs if not p.lost]
-    return np.stack([p.quat_wxyz for p in kept]), np.stack([p.v for p in kept])
