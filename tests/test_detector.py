@@ -18,10 +18,10 @@ import torch
 from typer.testing import CliRunner
 
 from objects import bracket
-from posekit.camera import Camera, mask_box
+from posekit.camera import Camera, box_iou, mask_box
 from posekit.cli.app import app
 from posekit.detect import maskrcnn
-from posekit.detect.coco import Truth, average_precision
+from posekit.detect.coco import Overlaps, Truth, average_precision, average_precision_of_overlaps
 from posekit.detect.external import DetectionsFile, categories_of, to_bop, to_coco
 from posekit.detect.maskrcnn import (
     SHIPPED,
@@ -263,6 +263,55 @@ def test_average_precision_of_what_can_be_counted() -> None:
     assert half["mask_ap50"] == pytest.approx(51 / 101)  # recall 0 to 0.5 at precision 1, of 101 points
     nobody = dataclasses.replace(truth, ignored=(False, True))
     assert average_precision([nobody], [_found([truth.masks[0]], [0.9])])["box_ap50"] == pytest.approx(1.0)
+
+
+def test_average_precision_of_known_overlaps_is_that_of_boxes() -> None:
+    from contextlib import redirect_stdout
+    from io import StringIO
+
+    from pycocotools.coco import COCO
+    from pycocotools.cocoeval import COCOeval
+
+    rng = np.random.default_rng(3)
+    annotations, results, pictures = [], [], []
+    for image in range(12):
+        true = [np.r_[xy, xy + rng.uniform(10, 40, 2)] for xy in rng.uniform(0, 100, (rng.integers(0, 5), 2))]
+        found = [t + rng.normal(0, 3, 4) for t in true for _ in range(rng.integers(0, 3))]
+        found += [np.r_[xy, xy + 20] for xy in rng.uniform(0, 100, (2, 2))]
+        scores = rng.random(len(found))
+        for t in true:
+            annotations.append({"id": len(annotations) + 1, "image_id": image, "category_id": 1, "iscrowd": 0,
+                                "bbox": [*t[:2], *(t[2:] - t[:2])], "area": float(np.prod(t[2:] - t[:2]))})  # fmt: skip
+        for f, s in zip(found, scores, strict=True):
+            results.append({"image_id": image, "category_id": 1, "bbox": [*f[:2], *(f[2:] - f[:2])], "score": s})
+        pictures.append((true, found, scores))
+    with redirect_stdout(StringIO()):
+        coco = COCO()
+        coco.dataset = {"images": [{"id": k} for k in range(12)], "annotations": annotations,
+                        "categories": [{"id": 1}], "info": {}}  # fmt: skip
+        coco.createIndex()
+        coco_eval = COCOeval(coco, coco.loadRes(results), "bbox")
+        coco_eval.evaluate()
+        coco_eval.accumulate()
+        coco_eval.summarize()
+    overlaps = [
+        Overlaps(s, np.zeros(len(t), bool), box_iou(np.reshape(f, (-1, 1, 4)), np.reshape(t, (1, -1, 4))))
+        for t, f, s in pictures
+    ]
+    assert 0.1 < coco_eval.stats[0] < 0.9
+    assert average_precision_of_overlaps(overlaps) == pytest.approx(coco_eval.stats[:2], abs=1e-9)
+
+
+def test_ignored_instances_are_neither_asked_for_nor_held_against_anyone() -> None:
+    def ap50(iou: list[list[float]], ignored: list[bool]) -> float:
+        return average_precision_of_overlaps([Overlaps(np.array([0.9, 0.8]), np.array(ignored), np.array(iou))])[1]
+
+    assert ap50([[0.0, 1.0], [1.0, 0.0]], [False, True]) == pytest.approx(1.0)
+    assert ap50([[0.0, 0.0], [1.0, 0.0]], [False, True]) == pytest.approx(0.5)
+    # an ignored instance excuses one detection, the best-scored one
+    assert ap50([[0.0, 1.0], [0.0, 1.0]], [False, True]) == 0.0
+    assert np.isnan(ap50([[0.0], [0.0]], [True]))
+    assert average_precision_of_overlaps([Overlaps(np.zeros(0), np.array([False]), np.zeros((0, 1)))]) == (0.0, 0.0)
 
 
 def test_masks_and_detections_survive_their_files(tmp_path: Path) -> None:

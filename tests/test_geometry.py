@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from posekit.camera import Camera, Zoom, mask_box
+from posekit.camera import Camera, Zoom, box_iou, mask_box, mask_iou
 from posekit.errors import CameraError
 from posekit.geometry import (
     Pose,
@@ -231,6 +231,18 @@ def test_boxes_are_edges() -> None:
     assert mask_box(mask) == (0, 0, 1, 1)
     mask[3, 5] = True
     assert mask_box(mask) == (0, 0, 6, 4)
+
+
+def test_intersection_over_union() -> None:
+    boxes = np.array([(0, 0, 2, 2), (1, 0, 3, 2), (5, 5, 6, 6), (5, 5, 5, 5)])
+    np.testing.assert_allclose(box_iou(boxes[:, None], boxes[None])[0], [1, 1 / 3, 0, 0])
+    assert box_iou(boxes[3], boxes[3]) == 0, "boxes without an area"
+    assert box_iou(np.zeros((0, 1, 4)), boxes[None]).shape == (0, 4)
+    mask = np.zeros((4, 6), bool)
+    assert mask_iou(mask, mask) == 0
+    mask[:, :2] = True
+    assert mask_iou(mask, mask) == 1
+    assert mask_iou(mask, np.roll(mask, 1, axis=1)) == pytest.approx(1 / 3)
 
 
 def test_field_of_view() -> None:

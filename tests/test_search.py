@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from bop_scene import CAMERA, brick, put, write_scene
 from objects import bracket
-from posekit.camera import Camera, box_overlap
+from posekit.camera import Camera, box_iou
 from posekit.cli.app import app
 from posekit.datasets.bop import BopDataset
 from posekit.detect.segmentation import encode, xywh
@@ -170,8 +170,8 @@ def test_instances_are_what_scores_and_does_not_overlap() -> None:
     assert kept(fixed, Source.BOX, SearchOptions(instances=0, min_score=0.3)) == [0.8, 0.5]
     assert kept(fixed, Source.BOX, SearchOptions(instances=1, min_score=0.3)) == [0.8]
     assert kept(fixed, Source.BOX, SearchOptions(min_score=0.9)) == []
-    assert box_overlap(BOXES[0], BOXES[1]) == pytest.approx(9 / 11)
-    assert box_overlap(BOXES[0], BOXES[2]) == 0 and box_overlap(BOXES[0], (0, 20, 10, 30)) == 0
+    assert box_iou(BOXES[0], BOXES[1]) == pytest.approx(9 / 11)
+    assert box_iou(BOXES[0], BOXES[2]) == 0 and box_iou(BOXES[0], (0, 20, 10, 30)) == 0
 
 
 def test_what_is_kept_depends_on_who_says_where_the_object_is() -> None:

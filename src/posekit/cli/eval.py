@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from posekit.cli.estimate import HypothesesOption, InitOption
 from posekit.cli.options import (
     LOOP,
     OUTPUT,
     ColourEdgeOption,
     DeviceOption,
+    HypothesesOption,
+    InitOption,
     IterationsOption,
     MaskEdgeOption,
     PerturbOption,
@@ -25,10 +25,10 @@ from posekit.cli.options import (
     UpdateOption,
     WeightsOption,
 )
+from posekit.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     from posekit.evaluate import Comparison
-    from posekit.evaluate.run import Progress
 
 DATA, STAGE = "Data", "Stage"
 
@@ -156,8 +156,11 @@ def evaluate(
     )
     name = dataset or (root.resolve().name if root is not None else "data")
     folder = out or Path("posekit-out") / f"eval-{name}-{stage}"
-    with _progress() as progress:
-        outcome = run(options, folder, command=_command(), csv=csv, force=force, with_vsd=vsd, progress=progress)
+    with progress_bar("count", "remaining") as update_bar:
+        outcome = run(
+            options, folder, command=_command(), csv=csv, force=force, with_vsd=vsd,
+            progress=lambda done, every: update_bar(completed=done, total=every),
+        )  # fmt: skip
     _print_results(outcome.results)
     for path in outcome.files:
         typer.echo(f"{path}")
@@ -206,18 +209,6 @@ def _noise(text: str) -> tuple[float, float, float, float]:
     except ValueError as error:
         raise ConfigError(f"--noise {text}: give four numbers, degrees and x, y, z in cm, such as 15,1,1,5.") from error
     return degrees, x, y, z
-
-
-@contextmanager
-def _progress() -> Iterator[Progress]:
-    """A bar on a terminal."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("pictures"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("pictures", total=None)
-        yield lambda done, every: bar.update(task, completed=done, total=every)
 
 
 _SHOWN = ("2deg_2cm", "5deg_5cm", "10deg_10cm", "5deg_5cm_sym", "10deg_10cm_sym", "add_01d", "adds_auc", "proj_5px",

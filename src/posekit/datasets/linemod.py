@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from abc import ABC, abstractmethod
 from functools import cached_property
 from pathlib import Path
 
@@ -97,33 +98,16 @@ def _listed(path: Path) -> set[int]:
     return frames
 
 
-class LinemodDataset(BopDataset):
-    """LINEMOD in BOP layout (``lm``), 13 objects, the frames of the split's test share.
+class _TestShare(ABC):
+    """What both readers have in common: 13 objects with a sequence each, of which the frames of the split's test share
+    are shown."""
 
-    A scene holds one object's sequence and has its number; other objects annotated in it are left out.
-    """
+    _kept: list[int]  # numbers of the scenes, each that of its object
 
-    def __init__(self, root: str | Path, split: str = "test") -> None:
-        super().__init__(root, split, targets=None)
-        self._kept = [s for s in super().scenes() if s in CLASSES]
-        if not self._kept:
-            raise InputError(
-                f"{self.root / split} has none of LINEMOD's 13 sequences (000001 is the ape's, and so on)."
-            )
-
-    @cached_property
+    @property
+    @abstractmethod
     def frames(self) -> _Split:
-        """Which frames of each object are the test; where no list says so, the annotated rotations do."""
-        frames, rotations = {}, {}
-        for scene in self._kept:
-            poses = {}
-            for _, image in super().images(scene):
-                found = [i for i in super().instances(scene, image, every=True) if i.obj_id == scene]
-                if found:
-                    poses[image] = found[0].T_cam_obj.R
-            frames[scene] = list(poses)
-            rotations[scene] = np.array(list(poses.values()))
-        return _Split(self.root, frames, rotations)
+        """Which frames of each object are the test."""
 
     @property
     def split_label(self) -> str:
@@ -144,6 +128,35 @@ class LinemodDataset(BopDataset):
         scenes = self._kept if scene is None else [scene]
         return [(s, image) for s in scenes for image in self.frames.test[s]]
 
+
+class LinemodDataset(_TestShare, BopDataset):
+    """LINEMOD in BOP layout (``lm``), 13 objects, the frames of the split's test share.
+
+    A scene holds one object's sequence and has its number; other objects annotated in it are left out.
+    """
+
+    def __init__(self, root: str | Path, split: str = "test") -> None:
+        super().__init__(root, split, targets=None)
+        self._kept = [s for s in BopDataset.scenes(self) if s in CLASSES]
+        if not self._kept:
+            raise InputError(
+                f"{self.root / split} has none of LINEMOD's 13 sequences (000001 is the ape's, and so on)."
+            )
+
+    @cached_property
+    def frames(self) -> _Split:
+        """Which frames of each object are the test; where no list says so, the annotated rotations do."""
+        frames, rotations = {}, {}
+        for scene in self._kept:
+            poses = {}
+            for _, image in BopDataset.images(self, scene):
+                found = [i for i in super().instances(scene, image, every=True) if i.obj_id == scene]
+                if found:
+                    poses[image] = found[0].T_cam_obj.R
+            frames[scene] = list(poses)
+            rotations[scene] = np.array(list(poses.values()))
+        return _Split(self.root, frames, rotations)
+
     def instances(self, scene: int, image: int, every: bool = False) -> list[Instance]:
         """The scene's own object in a picture; every: all that are annotated. Poses ``T_cam_obj`` in metres."""
         found = super().instances(scene, image, every)
@@ -155,7 +168,7 @@ def is_deepim(root: Path) -> bool:
     return (root / "data" / "observed").is_dir()
 
 
-class DeepimDataset:
+class DeepimDataset(_TestShare):
     """LINEMOD as DeepIM's scripts convert it: ``data/observed/06/000001-color.png`` (and -depth, -label),
     ``data/gt_observed/cat/000001-pose.txt`` (or beside the photograph), ``models/cat/textured.obj`` in metres.
 
@@ -184,16 +197,6 @@ class DeepimDataset:
         rotations = {o: np.array([self._pose(o, f).R for f in frames]) for o, frames in numbers.items()}
         return _Split(self.root, numbers, rotations)
 
-    @property
-    def split_label(self) -> str:
-        """Where the split comes from, for a person."""
-        return self.frames.label
-
-    @property
-    def split_hash(self) -> str:
-        """16 hexadecimal digits that name the split."""
-        return self.frames.digest
-
     def model_ids(self) -> list[int]:
         """Numbers of the objects that this copy has."""
         return self._kept
@@ -215,15 +218,6 @@ class DeepimDataset:
         """The object with its mesh's own diameter, metres. Raises MeshError where there is no mesh."""
         model = self.model(obj_id)
         return MeasuredModel(model, model.diameter)
-
-    def scenes(self) -> list[int]:
-        """Numbers of the scenes, each that of its object."""
-        return self._kept
-
-    def images(self, scene: int | None = None) -> list[tuple[int, int]]:
-        """(scene, image) of the test's frames, of one scene or of all."""
-        scenes = self._kept if scene is None else [scene]
-        return [(s, image) for s in scenes for image in self.frames.test[s]]
 
     def view(self, scene: int, image: int) -> View:
         """A frame with LINEMOD's camera. Raises ImageError where the picture is missing or damaged."""

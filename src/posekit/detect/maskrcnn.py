@@ -18,6 +18,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
+from posekit.camera import box_iou
 from posekit.detect.backbones import BACKBONES, LITE0_MEAN, LITE0_STD, feature_pyramid
 from posekit.detect.sharpen import sharpened
 from posekit.detect.vision import torchvision
@@ -264,7 +265,7 @@ def find_augmented(
     boxes, labels, scores, masks = (
         np.concatenate([getattr(found, name) for found in seen]) for name in ("boxes", "labels", "scores", "masks")
     )
-    overlaps = torchvision().ops.box_iou(torch.from_numpy(boxes), torch.from_numpy(boxes)).numpy()
+    overlaps = box_iou(boxes[:, None], boxes[None])
     order, groups = np.argsort(-scores, kind="stable"), []
     while len(order):
         same = (overlaps[order[0], order] > SAME) & (labels[order] == labels[order[0]])

@@ -20,7 +20,7 @@ import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 
-from posekit.camera import Box, Camera, box_overlap
+from posekit.camera import Box, Camera, box_iou, mask_iou
 from posekit.detect import Detector
 from posekit.detect.backbones import LITE0_MEAN, LITE0_STD, Lite0, lite0_imagenet, load_lite0
 from posekit.detect.maskrcnn import COCO, DOUBTFUL, SHIPPED, MaskRCNN, TrainedDetector, find, load_coco, load_detector
@@ -221,11 +221,15 @@ class NovelDetector:
     ) -> list[Detection]:
         scores = self.similarity.of(view, model, proposals, appearance)
         kept: list[Detection] = []
+        masks: list[NDArray[np.bool_]] = []
         for k in np.argsort(np.negative(scores), kind="stable"):
             proposal, score = proposals[int(k)], scores[int(k)]
             if score < self.options.min_score or len(kept) == self.options.max_detections:
                 break
-            if all(_overlap(proposal, other) < self.options.overlap for other in kept):
+            mask = proposal.mask
+            assert mask is not None
+            if all(mask_iou(mask, other) < self.options.overlap for other in masks):
+                masks.append(mask)
                 kept.append(Detection(proposal.box, proposal.mask, score, model.name, Source.NOVEL))
         return kept
 
@@ -291,13 +295,7 @@ def clipped(box: Box, size: tuple[int, int]) -> Box:
 
 def _same_instance(a: Detection, b: Detection, overlap: float) -> bool:
     """Whether two detections of one mesh have boxes that lie on each other."""
-    return a.label == b.label and box_overlap(a.box, b.box) >= overlap
-
-
-def _overlap(a: Detection, b: Detection) -> float:
-    """Intersection over union of two masks."""
-    assert a.mask is not None and b.mask is not None
-    return float((a.mask & b.mask).sum() / max(1, (a.mask | b.mask).sum()))
+    return a.label == b.label and bool(box_iou(a.box, b.box) >= overlap)
 
 
 def make_detector(

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from posekit.camera import Box, Camera, mask_box
+from posekit.camera import Box, Camera, box_mask, mask_box
 from posekit.errors import PromptError
 from posekit.mesh.model import ObjectModel
 from posekit.results import Detection, Source
@@ -60,7 +60,7 @@ class BoxPrompt:
             return [Detection(box=box, label=model.name) for model in models]
         mask = grabcut_mask(view.image, box) if self.mask_from == "grabcut" else None
         source = Source.FILLED if mask is None else Source.GRABCUT
-        mask = filled_mask(box, view.camera) if mask is None else mask
+        mask = box_mask(box, view.camera.size) if mask is None else mask
         return [Detection(box=box, mask=mask, label=model.name, source=source) for model in models]
 
 
@@ -94,14 +94,6 @@ def clip_box(box: Box, camera: Camera) -> Box:
     if clipped[2] - clipped[0] < 1 or clipped[3] - clipped[1] < 1:
         raise PromptError(f"box {_text(box)} lies outside the picture, which is {width}x{height} pixels.")
     return clipped
-
-
-def filled_mask(box: Box, camera: Camera) -> Mask:
-    """All pixels whose greater part lies in the box, at least one, (H, W)."""
-    mask = np.zeros((camera.height, camera.width), dtype=np.bool_)
-    x0, y0 = (min(round(low), size - 1) for low, size in zip(box[:2], camera.size, strict=True))
-    mask[y0 : max(round(box[3]), y0 + 1), x0 : max(round(box[2]), x0 + 1)] = True
-    return mask
 
 
 def grabcut_mask(image: NDArray[np.uint8], box: Box) -> Mask | None:

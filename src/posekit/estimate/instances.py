@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from posekit.camera import box_overlap
+from posekit.camera import box_iou
 from posekit.detect.novel import USUAL, WEIGHT, shifted
 from posekit.errors import ConfigError
 from posekit.mesh.model import ObjectModel
@@ -102,7 +102,7 @@ def instances_of(estimates: Sequence[Estimate], options: SearchOptions) -> list[
     """Those of an object's estimates that are instances of it, best first."""
     kept: list[Estimate] = []
     for each in sorted(estimates, key=lambda e: -e.score):
-        if each.score >= options.min_score and all(box_overlap(each.box, k.box) < options.overlap for k in kept):
+        if each.score >= options.min_score and all(box_iou(each.box, k.box) < options.overlap for k in kept):
             kept.append(each)
     return kept[: options.instances] if options.instances else kept
 
