@@ -9,7 +9,7 @@ import pytest
 
 from posekit.camera import Camera
 from posekit.errors import ConfigError, WeightsError
-from posekit.estimate.estimator import EstimateOptions, PoseEstimator, existence_score, score
+from posekit.estimate.estimator import EstimateOptions, PoseEstimator, existence_score, hypothesis_score
 from posekit.estimate.refine import pose_change
 from posekit.first_pose.hypotheses import perturbed_poses
 from posekit.geometry import Pose, PoseNoise
@@ -132,8 +132,8 @@ def test_poses_beside_are_tried_where_the_given_one_does_not_converge(
     example, starts = examples[0], []
     options = EstimateOptions(iterations=4, stop_angle_deg=stop_angle, perturb=beside)
     estimator = PoseEstimator(example.model, options=options)
-    heats = estimator._heats
-    monkeypatch.setattr(estimator, "_heats", lambda view, poses: starts.append(len(poses)) or heats(view, poses))
+    heats = estimator._candidates
+    monkeypatch.setattr(estimator, "_candidates", lambda view, poses: starts.append(len(poses)) or heats(view, poses))
     found = estimator.refine(example.view, perturbed_poses(example.T_cam_obj, example.model, np.deg2rad(20))[0])
     assert starts == tried
     assert found.iterations == (1 if stop_angle == 180 else 4)
@@ -167,8 +167,8 @@ def test_an_exact_mask_finishes_the_pose(examples) -> None:
 
 
 def test_the_score_prefers_small_angles_and_evidence() -> None:
-    assert score(0.5, 1.2) < score(0.02, 1.2)
-    assert score(0.02, 0.8) < score(0.02, 1.2)
+    assert hypothesis_score(0.5, 1.2) < hypothesis_score(0.02, 1.2)
+    assert hypothesis_score(0.02, 0.8) < hypothesis_score(0.02, 1.2)
 
 
 def test_what_is_not_there_is_doubted(examples) -> None:

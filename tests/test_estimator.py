@@ -66,11 +66,11 @@ def test_the_angle_is_that_of_the_pose_which_is_told(networks: Networks) -> None
     """Not of one before the last update, or before the outline was fitted."""
     model = bracket()
     start = Pose(so3_exp([0.0, 0.0, 0.3]) @ TRUTH.R, TRUTH.t)
-    estimator = oracle(model, TRUTH, networks, stop="fixed", iterations=1, contour=False, outline=False)
+    estimator = oracle(model, TRUTH, networks, stop="fixed", iterations=1, mask_edge=False, colour_edge=False)
     found = estimator.refine(photograph(model, TRUTH).with_mask(None), start)
     assert found.trace[0].angle == pytest.approx(0.3, abs=0.01)
     assert found.angle < 0.01 and found.converged and found.mask_edge_std is None
-    far = oracle(model, TRUTH, networks, stop="fixed", iterations=1, contour=False, outline=False)
+    far = oracle(model, TRUTH, networks, stop="fixed", iterations=1, mask_edge=False, colour_edge=False)
     far.predictor = Oracle(model, TRUTH, angles=[0.4])  # type: ignore[assignment]
     doubted = far.refine(photograph(model, TRUTH).with_mask(None), start)
     assert doubted.angle == pytest.approx(0.4) and not doubted.converged
@@ -126,8 +126,8 @@ def test_refine_returns_the_pose_nearest_to_the_given_one(networks: Networks) ->
     model = half_turned()
     [S] = model.symmetries.discrete
     start = Pose(so3_exp([0.05, 0.1, 0.0]) @ TRUTH.R, TRUTH.t)
-    estimator = oracle(model, TRUTH @ S, networks, update="regression", stop="fixed", iterations=1, contour=False,
-                       outline=False)  # fmt: skip
+    estimator = oracle(model, TRUTH @ S, networks, update="regression", stop="fixed", iterations=1, mask_edge=False,
+                       colour_edge=False)  # fmt: skip
     found = estimator.refine(photograph(model, TRUTH), start)
     assert found.branch is Branch.GIVEN
     assert pose_error(found.T_cam_obj, TRUTH)[0] < 0.02

@@ -212,7 +212,7 @@ def test_an_oracle_gives_the_true_pose(renderer: Renderer, matched: bool, monkey
         turns.append(np.rad2deg(rotation_angle(best.R.T @ truth.R)))
         places.append(np.linalg.norm((best @ model.T_obj_ctr).t - place) / place[2])
         overlaps.append((result.mask & drawn.mask).sum() / (result.mask | drawn.mask).sum())
-        assert result.presence > 0.9
+        assert result.existence_score > 0.9
     assert np.mean(overlaps) > 0.8
     if matched:
         assert max(turns) < 4.0 and max(places) < 0.02
@@ -224,5 +224,5 @@ def test_the_search_runs_untrained(renderer: Renderer) -> None:
     search = MatchingSearch(bracket(), small_net().eval(), renderer)
     view = View(np.zeros((480, 640, 3), np.uint8), Camera(572.4, 573.6, 325.3, 242.0, 640, 480))
     found = search.examine(view, Detection((200, 150, 320, 260)), 5)
-    assert found.mask.shape == (480, 640) and 0 <= found.presence <= 1 and len(found.hypotheses) <= 5
+    assert found.mask.shape == (480, 640) and 0 <= found.existence_score <= 1 and len(found.hypotheses) <= 5
     assert all(np.isfinite(h.T_cam_obj.matrix).all() for h in found.hypotheses)

@@ -17,7 +17,7 @@ from posekit.geometry import Pose, view_rotation
 from posekit.io.load import load_view
 from posekit.io.video import open_frames
 from posekit.render import Renderer
-from posekit.tracking.points import Look, follow_points
+from posekit.tracking.points import Keyframe, follow_points
 from posekit.view import View
 
 CAMERA = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
@@ -84,8 +84,8 @@ def test_black_surroundings_teach_their_colour_and_black_parts_are_followed() ->
     striped = np.where((np.arange(160) // 6 % 2 == 0)[None, :, None], seen.image, 0).astype(np.uint8)
     shown = View(striped, seen.camera, R_view_cam=seen.R_view_cam)
     T_view_ctr = Pose.rotation(seen.R_view_cam) @ truth @ model.T_obj_ctr
-    look = Look(shown, drawn, T_view_ctr, np.ones_like(drawn.mask))
-    points = follow_points(look, T_view_ctr, shown, model)
+    keyframe = Keyframe(shown, drawn, T_view_ctr, np.ones_like(drawn.mask))
+    points = follow_points(keyframe, T_view_ctr, shown, model)
     assert points is not None and len(points.points) >= 10
 
 

@@ -19,7 +19,20 @@ import typer
 from typer.core import TyperGroup
 
 from posekit._version import __version__
-from posekit.cli import demo, detect, doctor, download, estimate, eval, refine, render_views, synth, track, train
+from posekit.cli import (
+    calibrate,
+    demo,
+    detect,
+    doctor,
+    download,
+    estimate,
+    eval,
+    refine,
+    render_views,
+    synth,
+    track,
+    train,
+)
 from posekit.errors import PosekitError
 
 INTERRUPTED = 130  # as shells count it: 128 + SIGINT
@@ -147,6 +160,7 @@ app.command("synth")(synth.synth)
 app.add_typer(train.train, name="train")
 app.command("eval")(eval.evaluate)
 app.command("download")(download.download)
+app.command("calibrate")(calibrate.calibrate)
 app.command("doctor")(doctor.doctor)
 app.command("demo")(demo.demo)
 

@@ -93,6 +93,23 @@ def open_frames(source: str, camera: str | Path | None = None) -> Frames:
     )
 
 
+def open_uncalibrated(source: str) -> PictureFrames | VideoFrames:
+    """A video file, a picture, a folder of pictures or a glob of them as they were taken: frames have no camera.
+
+    Raises InputError where there is no such thing or nothing in it, ImageError where a video cannot be opened.
+    """
+    path = Path(source)
+    if path.is_file() and path.suffix.lower() not in PICTURES:
+        return VideoFrames(path, NO_CAMERA)
+    if path.is_file():
+        return PictureFrames([path], NO_CAMERA)
+    if path.is_dir():
+        return PictureFrames(_pictures(path.iterdir(), source), NO_CAMERA)
+    if glob.has_magic(source):
+        return PictureFrames(_pictures(map(Path, glob.glob(source)), source), NO_CAMERA)  # noqa: PTH207
+    raise InputError(f"there is no {source}: give pictures, a folder or glob of them, or a video.")
+
+
 def _only(cameras: list[Path]) -> Path:
     """The file of a scene's cameras. Raises InputError where it is one sensor's of several."""
     plain = [path for path in cameras if path.stem == "scene_camera"]
@@ -153,13 +170,27 @@ class _Intrinsics:
         return self.known[(size,)]
 
 
+class _NoCamera:
+    """Frames as they were taken, to calibrate their camera."""
+
+    def seen(self, image: Image, path: Path | None = None) -> tuple[Image, None, None]:  # noqa: ARG002
+        return image, None, None
+
+
+NO_CAMERA = _NoCamera()
+
+
+def _cameras_of(camera: str | Path | _NoCamera | None) -> _Intrinsics | _NoCamera:
+    return camera if isinstance(camera, _NoCamera) else _Intrinsics(camera)
+
+
 class PictureFrames:
     """Pictures in the order of the numbers in their names."""
 
     rate = RATE
 
-    def __init__(self, paths: list[Path], camera: str | Path | None) -> None:
-        self.paths, self.count, self._cameras = paths, len(paths), _Intrinsics(camera)
+    def __init__(self, paths: list[Path], camera: str | Path | _NoCamera | None) -> None:
+        self.paths, self.count, self._cameras = paths, len(paths), _cameras_of(camera)
 
     def __iter__(self) -> Iterator[Frame]:
         for number, path in enumerate(self.paths):
@@ -212,8 +243,8 @@ class SceneFrames:
 class VideoFrames:
     """A video file, by PyAV. What cannot be decoded is told frame by frame; a truncated file ends early."""
 
-    def __init__(self, path: Path, camera: str | Path | None) -> None:
-        self.path, self._cameras = path, _Intrinsics(camera)
+    def __init__(self, path: Path, camera: str | Path | _NoCamera | None) -> None:
+        self.path, self._cameras = path, _cameras_of(camera)
         with _opened(path) as container:
             stream = container.streams.video[0]
             self.rate = float(stream.average_rate or RATE)
@@ -248,7 +279,8 @@ class VideoFrames:
 
     def _frame(self, number: int, image: Image, seconds: float | None) -> Frame:
         try:
-            return Frame(number, *self._cameras.seen(image), seconds)
+            seen, camera, valid = self._cameras.seen(image)
+            return Frame(number, seen, camera, valid, seconds)
         except InputError as error:  # the size changed to another shape
             return Frame(number, None, seconds=seconds, problem=f"frame {number}: {error}")
 
