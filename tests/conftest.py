@@ -9,6 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from posekit.geometry import Pose, so3_exp
+from posekit.render import Renderer
+from posekit.synth.example import Example, make_example
 
 Array = NDArray[np.float64]
 
@@ -30,3 +32,15 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+@pytest.fixture(scope="session")
+def renderer() -> Renderer:
+    """One OpenGL context for all tests that draw with the usual settings."""
+    return Renderer()
+
+
+@pytest.fixture(scope="session")
+def example(renderer: Renderer) -> Example:
+    """The locomotive of posekit demo with its photograph and its true pose."""
+    return make_example(renderer)

@@ -15,14 +15,9 @@ from posekit import Camera, EstimateOptions, PoseEstimator, Result, api, estimat
 from posekit.errors import ImageError, PromptError
 from posekit.nets.weights import build, save_networks
 from posekit.render import Renderer
-from posekit.synth.example import Example, make_example, ply
+from posekit.synth.example import Example, ply
 
 CAMERA = "610,610,322,236"
-
-
-@pytest.fixture(scope="module")
-def example() -> Example:
-    return make_example(Renderer())
 
 
 @pytest.fixture(scope="module")

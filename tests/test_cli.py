@@ -30,7 +30,7 @@ from posekit.geometry import Pose, rotation_angle
 from posekit.io.load import load_pose
 from posekit.nets.weights import build, save_networks
 from posekit.render import Renderer
-from posekit.synth.example import Example, make_example, ply
+from posekit.synth.example import Example, ply
 
 Invoke = Callable[..., Result]
 
@@ -89,11 +89,6 @@ def test_version() -> None:
 
 
 # --- success ----------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def example() -> Example:
-    return make_example(Renderer())
 
 
 @pytest.fixture(scope="module")

@@ -56,11 +56,6 @@ SCENES = TabletopStreamConfig(
 
 
 @pytest.fixture(scope="module")
-def renderer() -> Renderer:
-    return Renderer()
-
-
-@pytest.fixture(scope="module")
 def untrained() -> TrainedDetector:
     torch.manual_seed(0)
     return TrainedDetector(TINY, build(TINY).eval())

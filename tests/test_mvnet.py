@@ -62,11 +62,6 @@ def small_net() -> MatchingMVNet:
 
 
 @pytest.fixture(scope="module")
-def renderer() -> Renderer:
-    return Renderer()
-
-
-@pytest.fixture(scope="module")
 def made(renderer: Renderer) -> tuple[ViewBank, list[QueryScene], list[QueryScene]]:
     rng = np.random.default_rng(4)
     bank = ViewBank.of(bracket(), renderer, fibonacci_sphere(QUERIES.views))
