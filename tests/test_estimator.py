@@ -158,7 +158,7 @@ def test_a_tracked_pose_stays_on_its_branch() -> None:
     assert first.estimate.converged and first.estimate.angle < 0.02, "as the network says"
     second = tracker.step(shown)
     assert second.estimate is not None and second.estimate.branch is Branch.LAST
-    tracker._lose()
+    tracker._reset()
     tracker.detector = None
     assert tracker.step(empty).state == LOST
     tracker.detector = Finding()  # type: ignore[assignment]

@@ -19,7 +19,7 @@ from posekit.cli.app import app
 from posekit.datasets.bop import BopDataset
 from posekit.detect.segmentation import encode, xywh
 from posekit.estimate.estimator import EstimateOptions, Estimators
-from posekit.estimate.instances import SearchOptions, estimates_of, find_instances, judged
+from posekit.estimate.instances import SearchOptions, estimates_of, find_instances, scored_by_poses
 from posekit.evaluate import EvalOptions
 from posekit.evaluate.stages import ImageStage
 from posekit.evaluate.truths import Truth, TruthReader
@@ -210,7 +210,7 @@ def test_detections_are_judged_by_their_poses(source: Source) -> None:
     fixed = Fixed([0.2, 0.7], BOXES[1:3])
     detections = [Detection(box, None, 0.56, MODEL.name, source) for box in BOXES[:3]]
     [found] = find_instances(lambda _: fixed, VIEW, [MODEL], detections, SearchOptions())
-    assert [(d.box, d.score) for d in judged(found)] == [(BOXES[2], 0.7), (BOXES[1], 0.2), (BOXES[0], 0.0)]
+    assert [(d.box, d.score) for d in scored_by_poses(found)] == [(BOXES[2], 0.7), (BOXES[1], 0.2), (BOXES[0], 0.0)]
 
 
 @pytest.mark.parametrize(("score", "state"), [(0.45, LOST), (0.55, RESTARTED)])

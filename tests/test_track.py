@@ -375,7 +375,7 @@ def test_what_cannot_be_tracked_is_said(model: ObjectModel, renderer: Renderer) 
     for wrong in (
         {"still_deg": 30},
         {"iterations": 0},
-        {"alike": 2},
+        {"min_colour_share": 2},
         {"keep": 0},
         {"mask": "true"},
         {"motion": "x"},

@@ -38,7 +38,7 @@ class MaskEdgeConfig:
     steps: int = 10  # of Gauss-Newton, each with a rendering
     knee: float = 1.0  # pixels of the photograph at which a point loses three quarters of its weight
     sigma: float = 0.3  # pixels, of a distance
-    correlated: float = 4.0  # so many neighbouring pixels of the outline err alike
+    correlated: float = 4.0  # number of neighbouring pixels of the outline whose errors are correlated
     turn: float = float(np.deg2rad(8.0))  # radians that the given pose may be off
     shift: float = 6.0  # likewise, crop pixels
     depth: float = 0.02  # likewise, share of the distance

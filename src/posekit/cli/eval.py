@@ -105,11 +105,11 @@ def evaluate(
     out: Annotated[
         Path | None,
         typer.Option(
-            metavar="DIR", help="Folder for the results; the same run in it is gone on with.", rich_help_panel=OUTPUT
+            metavar="DIR", help="Folder for the results; the same run in it is continued.", rich_help_panel=OUTPUT
         ),
     ] = None,
     force: Annotated[
-        bool, typer.Option("--force", help="Throw an evaluation in that folder away.", rich_help_panel=OUTPUT)
+        bool, typer.Option("--force", help="Delete an evaluation in that folder.", rich_help_panel=OUTPUT)
     ] = False,
     comparison: Annotated[
         tuple[Path, Path] | None,
@@ -118,7 +118,7 @@ def evaluate(
 ) -> None:
     """Measure poses as the field does: tables, results.json, a BOP CSV and an HTML report.
 
-    A killed run goes on where it was when the command is given again.
+    A killed run continues when the same command is given again.
     """
     if comparison is not None:
         from posekit.evaluate import compare

@@ -63,7 +63,7 @@ DetectorOption = Annotated[
     str | None,
     typer.Option(
         metavar="novel|coco|FILE",
-        help="Who looks for the object where nothing else says where it is: novel (the default) needs no training.",
+        help="Detector for an object whose place is not given: novel (the default) needs no training.",
         rich_help_panel=INPUT,
     ),
 ]
@@ -104,7 +104,7 @@ MaskEdgeOption = Annotated[
     bool,
     typer.Option(
         "--mask-edge/--no-mask-edge",
-        help="Fit the pose to the edge of the given mask, where the mask proves exact to the pixel.",
+        help="Fit the pose to the edge of the given mask, where the mask is exact to the pixel.",
         rich_help_panel=LOOP,
     ),
 ]

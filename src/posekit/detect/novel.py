@@ -49,8 +49,8 @@ WEIGHT, USUAL = 20.0, 0.56  # of an object's similarity, and the one that says n
 class NovelOptions:
     """How `NovelDetector` looks for objects that no detector was trained for."""
 
-    scales: tuple[float, ...] = (2 / 3, 1.0, 4 / 3)  # of the detector's ``use_size``, one look at the picture each
-    proposals: int = 80  # of a look at most
+    scales: tuple[float, ...] = (2 / 3, 1.0, 4 / 3)  # of the detector's ``use_size``, one run of the detector each
+    proposals: int = 80  # of a run at most
     same: float = 0.7  # intersection over union of boxes from which two scales propose the same
     screened: int = 40  # proposals that are compared with templates
     min_proposal_score: float = 0.1  # their least score
@@ -95,20 +95,20 @@ class AppearanceSimilarity:
     def of(
         self, view: View, model: ObjectModel, proposals: Sequence[Detection], appearance: _Appearance
     ) -> list[float]:
-        """Of each proposal, in [0, 1], in two rounds: what neither its features nor its chroma speaks for gets no
-        template search, and 0."""
+        """Of each proposal, in [0, 1], in two rounds: the template search is for the best by features and chroma; the
+        others get 0."""
         search, known = self._of(model)
         options = self.options
-        alike = np.maximum(0.0, (appearance.features @ known.features.T).max(axis=1) / len(LEVELS)).astype(np.float64)
+        cosine = np.maximum(0.0, (appearance.features @ known.features.T).max(axis=1) / len(LEVELS)).astype(np.float64)
         apart = np.linalg.norm(known.chroma[None] - appearance.chroma[:, None], axis=2).min(axis=1)
         own = np.array([proposal.score for proposal in proposals])
-        faded = np.exp(-apart / options.chroma) * own**options.objectness
-        screen = alike * faded
+        weight = np.exp(-apart / options.chroma) * own**options.objectness
+        screen = cosine * weight
         scores = np.zeros(len(proposals))
         for k in np.argsort(-screen, kind="stable")[: options.screened]:
             first = search.search(view, proposals[k], 1)
             shape = max(0.0, first[0].score) / (1 + search.options.colour) if first else 0.0
-            scores[k] = min(1.0, (shape + options.features * alike[k]) / (1 + options.features)) * faded[k]
+            scores[k] = min(1.0, (shape + options.features * cosine[k]) / (1 + options.features)) * weight[k]
         return [float(score) for score in scores]
 
     def _of(self, model: ObjectModel) -> tuple[TemplateSearch, _Appearance]:
@@ -168,8 +168,7 @@ class NovelDetector:
         self._textured: dict[ObjectModel, FeatureSearch] = {}
 
     def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
-        """The instances of the models, those found by local features first; with no models, whatever looks like an
-        object."""
+        """The instances of the models, those found by local features first; with no models, objects of any kind."""
         proposals = self.propose(view)
         if not models:
             return proposals
@@ -255,8 +254,8 @@ class SimilarityDetector:
             if not mine or (model.colors is None and model.texture is None):
                 continue
             proposals = [found[k] for k in mine]
-            alike = self.similarity.of(view, model, proposals, self.similarity.appearance(view, proposals))
-            for k, similarity in zip(mine, alike, strict=True):
+            similarities = self.similarity.of(view, model, proposals, self.similarity.appearance(view, proposals))
+            for k, similarity in zip(mine, similarities, strict=True):
                 found[k] = replace(found[k], score=with_similarity(found[k].score, similarity))
         left: dict[str | None, int] = {}
         kept = []
@@ -307,9 +306,9 @@ def make_detector(
     doubtful: bool = False,
 ) -> tuple[Detector, tuple[str, ...]]:
     """A network's Detector and the names that its detections may have. name: "novel" (the default), "coco", or a
-    trained detector's file or folder. max_detections: of a mesh. doubtful: whether poses will judge the detections, so
-    that trained detectors' doubtful ones are wanted too, and no more than ``max_detections``. Raises WeightsError,
-    ConfigError.
+    trained detector's file or folder. max_detections: of a mesh. doubtful: whether the detections are verified by
+    poses, so that trained detectors' doubtful ones are wanted too, and no more than ``max_detections``. Raises
+    WeightsError, ConfigError.
     """
     file = SHIPPED if name is None or name == ANY else Path(name)
     trained = load_coco() if name == COCO else load_detector(file)

@@ -22,15 +22,16 @@ MASK_SOURCES = ("none", "grabcut", "filled")
 
 # Chosen on real crops: docs/decisions/0004-mask-from-a-box.md
 _SIDE = 176  # longer side of the picture that GrabCut works on, pixels
-_MARGIN = 0.12  # ground round the box that it sees, of the box's longer side
-_SURE, _LIKELY = 0.45, 1.15  # ellipses, of the box's own: inside the first is object, outside the second likely ground
+_MARGIN = 0.12  # background round the box that it sees, of the box's longer side
+# ellipses, of the box's own: inside the first is object, outside the second likely background
+_SURE, _LIKELY = 0.45, 1.15
 _ROUNDS = 3
 _LEAST_COVER = 0.75  # of the box's width and height: a mask that reaches less far has lost a part of the object
 _LEAST_AREA, _MOST_AREA = 0.2, 0.97  # of the box
 
 
 class Detector(Protocol):
-    """Whatever finds objects in a photograph."""
+    """A detector: finds objects in a photograph."""
 
     def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
         """The instances of the models in a view; none is an empty list."""
@@ -97,7 +98,7 @@ def clip_box(box: Box, camera: Camera) -> Box:
 
 
 def grabcut_mask(image: NDArray[np.uint8], box: Box) -> Mask | None:
-    """The object in a box, separated from the ground by colour (GrabCut: Rother et al., 2004).
+    """The object in a box, separated from the background by colour (GrabCut: Rother et al., 2004).
 
     image: uint8 RGB (H, W, 3). box: edges, inside the picture. The same picture and box give the same mask.
     Returns a bool (H, W); None where what comes out is not a silhouette that fills the box as an object would.
@@ -111,7 +112,7 @@ def grabcut_mask(image: NDArray[np.uint8], box: Box) -> Mask | None:
     inner = _inner(box, window, size)
     labels = _first_labels(inner, size)
     if not ((labels == cv2.GC_BGD) | (labels == cv2.GC_PR_BGD)).any():
-        return None  # no ground to learn from
+        return None  # no background to learn from
     cv2.setRNGSeed(0)
     models = np.zeros((2, 1, 65))
     cv2.grabCut(small[..., ::-1].copy(), labels, None, models[0], models[1], _ROUNDS, cv2.GC_INIT_WITH_MASK)
@@ -140,7 +141,7 @@ def _inner(box: Box, window: tuple[int, int, int, int], size: tuple[int, int]) -
 
 
 def _first_labels(inner: tuple[int, int, int, int], size: tuple[int, int]) -> NDArray[np.uint8]:
-    """Ground outside the box, object in its middle, and guesses between, (h, w)."""
+    """Background outside the box, object in its middle, and guesses between, (h, w)."""
     a, b, c, d = inner
     x, y = np.arange(size[0]), np.arange(size[1])[:, None]
     radius = np.hypot((x - 0.5 * (a + c - 1)) / (0.5 * (c - a)), (y - 0.5 * (b + d - 1)) / (0.5 * (d - b)))
@@ -153,7 +154,7 @@ def _first_labels(inner: tuple[int, int, int, int], size: tuple[int, int]) -> ND
 
 
 def largest_blob(mask: Mask) -> Mask:
-    """The largest connected part without specks, fringes and holes."""
+    """The largest connected part, after opening, with holes filled."""
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
     smooth = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, kernel)
     outlines, _ = cv2.findContours(smooth, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)

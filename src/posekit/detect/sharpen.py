@@ -15,11 +15,11 @@ from posekit.results import Detection
 Mask = NDArray[np.bool_]
 
 SIDE = 96  # longer side of the picture that GrabCut works on, pixels
-MARGIN = 0.35  # ground round the box that it sees, of the box's longer side
+MARGIN = 0.35  # background round the box that it sees, of the box's longer side
 DOUBT = 0.1  # how far on both sides of the mask's outline the true one may lie, of the box's longer side
 ROUNDS = 3
-LEAST_OVERLAP = 0.4  # with the network's mask; what agrees less with it is another thing
-LEAST = 20  # pixels of a mask that say anything
+LEAST_OVERLAP = 0.4  # with the network's mask; what overlaps less is another object
+LEAST = 20  # pixels of a mask, at least
 
 
 def sharpened(image: NDArray[np.uint8], detection: Detection) -> Detection:
@@ -61,7 +61,7 @@ def _sharp(image: NDArray[np.uint8], rough: Mask, box: Box) -> Mask | None:
 
 
 def _labels(mask: Mask, reach: int) -> NDArray[np.uint8]:
-    """Sure within ``reach`` pixels of the outline neither of the object nor of the ground, (h, w)."""
+    """Sure within ``reach`` pixels of the outline neither of the object nor of the background, (h, w)."""
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     solid = mask.astype(np.uint8)
     inner = cv2.erode(solid, kernel, borderValue=0)

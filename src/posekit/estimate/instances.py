@@ -1,4 +1,4 @@
-"""From detections that may be wrong to objects' instances: estimate, keep what the render bears out.
+"""From detections that may be wrong to objects' instances: estimate, and keep what the rendering confirms.
 
 The one way from a picture, meshes and detections to poses, for ``posekit estimate``, ``eval``, ``detect --verify`` and
 the tracker's search.
@@ -43,7 +43,7 @@ class SearchOptions:
     @classmethod
     def usual(cls, detections: Sequence[Detection]) -> SearchOptions:
         """By who says where the objects are. What a person says is taken as it is; what another program says gives all
-        instances that do not overlap; a detector's answers must be borne out by the render."""
+        instances that do not overlap; a detector's detections must be confirmed by the rendering."""
         sources = [detection.source for detection in detections]
         if sources and all(source.given for source in sources):
             return cls(0, 0.0, 1.0 if all(source.by_hand for source in sources) else 0.5)
@@ -52,7 +52,7 @@ class SearchOptions:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What a picture shows of one mesh. detections: that were looked at. estimates: what they led to, in their order.
+    """What a picture shows of one mesh. detections: that were estimated. estimates: what they led to, in their order.
     instances: those of the estimates that are kept, best first."""
 
     model: ObjectModel
@@ -107,7 +107,7 @@ def instances_of(estimates: Sequence[Estimate], options: SearchOptions) -> list[
     return kept[: options.instances] if options.instances else kept
 
 
-def judged(found: Found) -> list[Detection]:
+def scored_by_poses(found: Found) -> list[Detection]:
     """A model's detections with the scores of the estimates that they led to (0 where to none), best first."""
     scores = {id(each.detection): each.score for each in found.estimates}
     scored = [replace(each, score=scores.get(id(each), 0.0)) for each in found.detections]

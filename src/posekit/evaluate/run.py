@@ -55,7 +55,7 @@ def evaluate(
 ) -> Outcome:
     """Run a stage, score it, and write results.json, the BOP CSV and report.html into ``out``.
 
-    A run that was interrupted is gone on with. csv: the results file of the ``score`` stage. with_vsd: where the
+    A run that was interrupted is continued. csv: the results file of the ``score`` stage. with_vsd: where the
     data set has depth. progress: called with the numbers of finished and of all pictures.
     Raises ConfigError, InputError, OutputError and what the stages raise.
     """

@@ -26,7 +26,7 @@ from posekit.detect.prompts import clip_box
 from posekit.detect.segmentation import encode, xywh
 from posekit.errors import PromptError
 from posekit.estimate.estimator import Estimators, PoseEstimator
-from posekit.estimate.instances import SearchOptions, find_instances, judged
+from posekit.estimate.instances import SearchOptions, find_instances, scored_by_poses
 from posekit.evaluate.options import DETECTOR, GIVEN, EvalOptions
 from posekit.evaluate.tracking import Sequences
 from posekit.evaluate.truths import Truth, TruthReader, pictures, selected
@@ -122,7 +122,7 @@ class ImageStage:
         return entries
 
     def _regions(self, view: View, scene: int, image: int) -> list[FoundRegion]:
-        """What the file has for a picture; what does not fit the picture is skipped and told."""
+        """What the file has for a picture; what does not fit the picture is skipped and logged."""
         found = []
         for region in self._files.get((scene, image), ()):
             try:
@@ -136,7 +136,7 @@ class ImageStage:
 
     def _detected(self, view: View, scene: int, image: int) -> tuple[list[Record], list[FoundRegion]]:
         """Estimates from what the detector finds of the data set's objects, and the detections. As `posekit estimate`
-        does, only what the render bears out is kept, but any number of instances; detections are scored by the poses
+        does, only what the rendering confirms is kept, but any number of instances; detections are scored by the poses
         that they lead to."""
         numbers = self.options.objects or tuple(self.data.model_ids())
         models = {obj_id: self.data.model(obj_id) for obj_id in numbers}
@@ -148,7 +148,7 @@ class ImageStage:
         entries, regions = [], []
         results = find_instances(self._estimators_of, view, list(models.values()), found, SearchOptions(instances=0))
         for obj_id, each in zip(models, results, strict=True):
-            regions += [_region(d, scene, image, obj_id, seconds) for d in judged(each)]
+            regions += [_region(d, scene, image, obj_id, seconds) for d in scored_by_poses(each)]
             entries += [_entry(e, obj_id, None) | {"detection_score": _detection_score(e)} for e in each.instances]
         return entries, regions
 

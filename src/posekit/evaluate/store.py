@@ -1,4 +1,4 @@
-"""An evaluation's folder: one file for each finished picture, so that a killed run goes on where it was.
+"""An evaluation's folder: one file for each finished picture, so that a killed run can be continued.
 
 ``run.json`` says what decides the results; a folder of another run is refused. ``pictures/SCENE_IMAGE.json`` are the
 records, each written whole or not at all.
@@ -21,7 +21,7 @@ Picture = tuple[int, int]
 class RunFolder:
     """Records on disk. identity: what decides the results, plain values.
 
-    Raises OutputError where the folder holds other files or another run; with ``force`` a run in it is thrown away.
+    Raises OutputError where the folder holds other files or another run; with ``force`` a run in it is deleted.
     """
 
     def __init__(self, path: Path, identity: Mapping[str, Any], force: bool = False) -> None:

@@ -30,7 +30,7 @@ class TrueMask:
 
 
 class Sequences:
-    """One tracker for each object of the scene that is at work; frames come in order. A lost object's true mask stands
+    """One tracker for each object of the current scene; frames come in order. A lost object's true mask stands
     for the detector. Objects that a scene has several times are followed once, the first of them."""
 
     def __init__(self, estimator: Callable[[int], PoseEstimator], runtime: str) -> None:

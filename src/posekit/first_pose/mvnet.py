@@ -43,7 +43,7 @@ class MatchingOptions:
 
 
 class FirstPoseSearch(Protocol):
-    """Whatever gives first poses for a detection."""
+    """A source of first poses for a detection."""
 
     def search(self, view: View, detection: Detection, count: int) -> list[Hypothesis]:
         """At most ``count`` ``T_cam_obj``, best first."""
@@ -52,7 +52,7 @@ class FirstPoseSearch(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Examined:
-    """What MV-Net says of a detection. hypotheses: best first. mask: bool (H, W), the visible object in the photograph.
+    """MV-Net's output for a detection. hypotheses: best first. mask: bool (H, W), the visible object in the photograph.
     existence_score: probability that the box shows the mesh."""
 
     hypotheses: list[Hypothesis]
@@ -116,11 +116,11 @@ class MatchingSearch:
         self.encoded = Encoded(*(torch.cat(parts) for parts in zip(*chunks, strict=True)))
 
     def search(self, view: View, detection: Detection, count: int) -> list[Hypothesis]:
-        """The best ``count`` first poses for a detection's box, best first; its mask is not looked at."""
+        """The best ``count`` first poses for a detection's box, best first; its mask is not used."""
         return self.examine(view, detection, count).hypotheses
 
     def examine(self, view: View, detection: Detection, count: int) -> Examined:
-        """As `search`, with the mask and the presence."""
+        """As `search`, with the mask and the existence score."""
         zoom = zoom_to_box(view.camera, detection.box, self.mvnet.config.size, enlarge=self.options.enlarge)
         answer = self.answer(view.zoomed(zoom))
         found: list[Hypothesis] = []
@@ -173,8 +173,8 @@ class MatchingSearch:
         there = 1.0 - share[:, NONE] > self.options.present
         kept = there & (weight > self.options.likely) & (np.abs(points).sum(1) > 0)
         columns = self.mvnet.columns
-        home = np.arange(len(cell))
-        pixels = np.stack([home % columns, home // columns], axis=1) * CELL + 0.5 * (CELL - 1)
+        index = np.arange(len(cell))
+        pixels = np.stack([index % columns, index // columns], axis=1) * CELL + 0.5 * (CELL - 1)
         return _Points(points[kept] * self.model.diameter, pixels[kept], weight[kept])
 
     def _solved(self, found: _Points, camera: Camera) -> Pose | None:

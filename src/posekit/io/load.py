@@ -1,4 +1,4 @@
-"""What people hand over: photographs, masks, boxes, cameras, poses."""
+"""Input from people: photographs, masks, boxes, cameras, poses."""
 
 from __future__ import annotations
 
@@ -74,9 +74,9 @@ def load_image(path: str | Path) -> NDArray[np.uint8]:
     """A picture as uint8 RGB (H, W, 3), turned upright as its EXIF data says.
 
     Grey and palette pictures become RGB, transparent parts black. 16 bits become 8 by the range that is used: 10 or 12
-    bits in a file of 16 are seen by their largest value, and said. Damaged EXIF data do not stop a good picture.
-    Raises ImageError where the file is missing, no picture, damaged, smaller than 16 pixels or over 100 megapixels
-    (POSEKIT_MOST_PIXELS). A JPEG that lacks a few of its last rows alone is read, and told.
+    bits in a file of 16 are recognised by their largest value, which is logged. Damaged EXIF data do not stop a good
+    picture. Raises ImageError where the file is missing, no picture, damaged, smaller than 16 pixels or over 100
+    megapixels (POSEKIT_MOST_PIXELS). A JPEG that lacks a few of its last rows alone is read, which is logged.
     """
     path = Path(path)
     with _opened(path, "picture", ImageError) as image:
@@ -97,7 +97,7 @@ def load_image(path: str | Path) -> NDArray[np.uint8]:
 def load_mask(path: str | Path, size: Size | None = None, *, allow_empty: bool = False) -> NDArray[np.bool_]:
     """A mask (H, W) from a picture: True where a pixel is brighter than half of the brightest (and not transparent).
 
-    A pixel's brightness is its brightest channel. Values in between, as JPEG makes them, are said; a picture of a few
+    A pixel's brightness is its brightest channel. Values in between, as JPEG makes them, are logged; a picture of a few
     small numbers is one of labels, and refused. size: (width, height) that it must have. Raises PromptError where it
     has another, is no picture, or is empty and may not be.
     """
@@ -154,7 +154,7 @@ def _opened(path: Path, what: str, kind: type[InputError]) -> Iterator[Image.Ima
 
 
 def _cut_short(path: Path, image: Image.Image, error: OSError) -> Image.Image:
-    """A baseline JPEG whose file ends a little early, as OpenCV reads it, which is told. Raises the given error
+    """A baseline JPEG whose file ends a little early, as OpenCV reads it, which is logged. Raises the given error
     for other pictures, and OSError where more than a few rows are missing."""
     if image.format not in ("JPEG", "MPO") or image.info.get("progressive"):
         raise error

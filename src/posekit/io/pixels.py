@@ -26,7 +26,8 @@ _TURNS = {
 
 
 def eight_bit(values: NDArray[np.integer], label: str) -> NDArray[np.uint8]:
-    """Whole numbers up to 65535 as 8 bits, by the range that is used: 8, 10, 12, 14 or 16 bits; what is taken is said.
+    """Whole numbers up to 65535 as 8 bits, by the range that is used: 8, 10, 12, 14 or 16 bits; what is taken is
+    logged.
 
     Raises ValueError where a value is negative or larger.
     """

@@ -27,7 +27,7 @@ _TRANSFORM = "KHR_texture_transform"
 _WRONG = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, struct.error)
 
 
-def gltf_put_right(kind: str, data: bytes, label: str, fetch: Callable[[str], bytes]) -> bytes:
+def corrected_gltf(kind: str, data: bytes, label: str, fetch: Callable[[str], bytes]) -> bytes:
     """A file's bytes with texture transforms (KHR_texture_transform) and the chosen set of texture coordinates applied,
     and embedded textures of 16 bits made 8.
 

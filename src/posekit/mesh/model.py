@@ -66,7 +66,7 @@ class ObjectModel:
         """Read a PLY, OBJ (with MTL and textures), GLB, glTF or STL file.
 
         units: "mm", "cm", "m", "in" (inches), or "auto": metres where the diameter is below 3, millimetres where it is
-        above 20; what is taken is said, with the object's length.
+        above 20; what is taken is logged, with the object's length.
         symmetry: a text for `Symmetries.parse`, a JSON file's name, or symmetries; otherwise they are read from a
         ``models_info.json`` beside the mesh (``obj_000009.ply`` by its number, other names by their stem).
 

@@ -1,4 +1,4 @@
-"""Polygons cut into triangles, concave ones too. The only door to mapbox_earcut."""
+"""Polygons cut into triangles, concave ones too. The only module that imports mapbox_earcut."""
 
 from __future__ import annotations
 

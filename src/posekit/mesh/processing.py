@@ -31,9 +31,9 @@ def smooth_normals(vertices: Floats, faces: NDArray[np.int64]) -> tuple[NDArray[
     total, left, step = weighted.copy(), np.arange(len(order)), 1
     while left.size:  # each corner meets the one that lies `step` further on at the same place
         left = left[left + step < ends[left]]
-        alike = left[np.einsum("ij,ij->i", normal[left], normal[left + step]) > _CREASE]
-        total[alike] += weighted[alike + step]
-        total[alike + step] += weighted[alike]
+        smooth = left[np.einsum("ij,ij->i", normal[left], normal[left + step]) > _CREASE]
+        total[smooth] += weighted[smooth + step]
+        total[smooth + step] += weighted[smooth]
         step += 1
     unit = np.empty_like(total)
     length = np.linalg.norm(total, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Mesh files as trimesh reads them, with what it leaves out; the only door to trimesh."""
+"""Mesh files as trimesh reads them, with what it leaves out; the only module that imports trimesh."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from posekit.errors import MeshError
 from posekit.io.limits import limit
 from posekit.io.pixels import deep_colour, eight_bit
 from posekit.mesh.atlas import Part
-from posekit.mesh.formats import ply_colours, ply_faces, put_right
+from posekit.mesh.formats import corrected, ply_colours, ply_faces
 from posekit.mesh.processing import checked_mesh
 
 log = logging.getLogger("posekit")
@@ -109,7 +109,7 @@ def read_parts(path: Path) -> list[Part]:
     assets = _Assets(path)
     try:
         loaded = trimesh.load(
-            io.BytesIO(put_right(kind, data, path.name, assets.get)),
+            io.BytesIO(corrected(kind, data, path.name, assets.get)),
             file_type=kind[1:],
             resolver=assets,
             process=False,

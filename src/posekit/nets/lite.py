@@ -191,7 +191,7 @@ def similarity_of(rendered: Tensor, observed: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class LiteOutput:
-    """All that the lite losses look at. flows: (B, 2, h, w) in pixels on cells, coarse to fine.
+    """All that the lite losses need. flows: (B, 2, h, w) in pixels on cells, coarse to fine.
     rigid: (B, 2, h, w) in pixels on anchors, what the motions solved from the coarse and the fine flow induce.
     compressed_angle: (B,). similarities: (B, h * w, h * w + 1), logits of which observed cell each rendered one is, the
     last of them none, before and after the exchange."""
@@ -317,12 +317,12 @@ def with_none(similarity: Tensor, none: Tensor) -> Tensor:
 def soft_flow(similarity: Tensor, cells: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """The mean place that the softmax over each rendered cell's similarities (B, h * w, h * w + 1) gives, as flow
     (B, 2, h, w) in pixels; and (B, 2, h, w), the largest share of one place and the share of none."""
-    home = _grid(*cells, similarity)
+    grid = _grid(*cells, similarity)
     share = torch.softmax(similarity[:, :, :-1], dim=2)
-    place = torch.einsum("bnm,cm->bcn", share, home[0].flatten(1))
+    place = torch.einsum("bnm,cm->bcn", share, grid[0].flatten(1))
     none = torch.sigmoid(similarity[:, :, -1] - torch.logsumexp(similarity[:, :, :-1], dim=2))
     found = torch.stack([share.amax(2), none], dim=1).unflatten(2, cells)
-    return (place.unflatten(2, cells) - home) * CELL, found
+    return (place.unflatten(2, cells) - grid) * CELL, found
 
 
 def normals_of(relief: Tensor, mask: Tensor) -> Tensor:

@@ -135,7 +135,7 @@ class Across(nn.Module):
 
 
 class Block(nn.Module):
-    """The crop's cells and the views' learn of each other."""
+    """Attention between the crop's cells and the views'."""
 
     def __init__(self, channels: int, heads: int, inner: int) -> None:
         super().__init__()
@@ -181,7 +181,7 @@ class Silhouettes(nn.Module):
 
 class MatchingMVNet(nn.Module):
     """See the module's text. tower: (B, 3, H, W), RGB in [-0.5, 0.5] -> features at 1/4 and 1/8, config.widths wide.
-    views: directions. kept: views that are looked at closely. channels: of the tokens. part: of the codes of cells."""
+    views: directions. kept: views that are compared in full. channels: of the tokens. part: of the codes of cells."""
 
     def __init__(self, tower: nn.Module, config: MatchingConfig, views: int = 42, kept: int = 8, *,
                  channels: int = 128, heads: int = 4, blocks: int = 3, inner: int = 64,

@@ -85,7 +85,7 @@ def _paste(picture: Image, texture: Image, rng: Rng) -> None:
 def photograph(image: Image, rng: Rng) -> Image:
     """Colour jitter, blur and sensor noise of a camera, uint8 (H, W, 3) to the same.
 
-    The colours go through a table for each channel: gain, contrast, gamma and white balance at one look-up.
+    The colours go through a table for each channel: gain, contrast, gamma and white balance in one lookup.
     """
     levels = np.linspace(0, 1, 256)
     gain = np.exp(rng.normal() * 0.18) * np.exp(rng.normal(size=(3, 1)) * 0.06)

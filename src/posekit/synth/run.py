@@ -1,4 +1,4 @@
-"""A data set made by one process, several, or a cluster: begun, gone on with, finished.
+"""A data set made by one process, several, or a cluster: begun, continued, finished.
 
 Image n is a function of the configuration and n, and is written before its record: whoever makes it, in whatever
 order, the data set is the same, and one that was killed goes on with the images that have no record.

@@ -71,7 +71,7 @@ class Sequences:
             image = add_noise(drawn.image, take.noise, noise)
             yield place, Picture(image, take.camera, drawn.annotations, drawn.depth, take.T_cam_world(place / RATE))
 
-    # --- what happens ---
+    # --- motion ---
 
     def _take(self, motion: Motion, rng: Rng) -> Take:
         camera, light = random_camera(self.config.size, rng), random_light(rng)
@@ -106,7 +106,7 @@ class Sequences:
         middle = Pose(R, 0.6 * start.apply(model.center) - R @ thing.center)
         return Thing(None, thing, passing(middle, reach, self.config.frames / RATE))
 
-    # --- how it looks ---
+    # --- drawing ---
 
     def _frame(self, take: Take, seconds: float) -> Drawn:
         """Sharp where little moves while the shutter is open, else the mean of several moments."""

@@ -52,7 +52,7 @@ class DetectorConfig:
     """The training of a detector."""
 
     recipe: str = "detector"
-    agnostic: bool = False  # learn objects of any kind, procedural ones beside the given meshes
+    agnostic: bool = False  # detect objects of any kind, procedural ones beside the given meshes
     epochs: int = 10  # of ``epoch`` scenes each, where above 0; they give the steps
     epoch: int = 2000
     steps: int = 5000

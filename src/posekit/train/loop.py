@@ -3,9 +3,9 @@
     with batches:  loss, backward, clip, step, average
     now and then:  log, validate, export, checkpoint
 
-Nothing random outlives a step: batch k is a function of (seed, k), and torch is seeded anew for each step. A checkpoint
-therefore needs the weights, their average, the optimiser's moments and the step's number, and a training that was
-killed ends as one that was not.
+No random state outlives a step: batch k is a function of (seed, k), and torch is seeded anew for each step. A
+checkpoint therefore needs the weights, their average, the optimiser's moments and the step's number, and a training
+that was killed ends as one that was not.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Batch = dict[str, Tensor]
 M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # malloc.h
 PROFILED = (3, 10)  # steps that --profile leaves out, and then records
 PATIENCE = 20  # steps in a row without a finite gradient that a GPU leaves out before the training ends
-SHOWN = 0.5  # seconds between two looks at the losses: a look waits for the GPU
+READ_EVERY = 0.5  # seconds between two reads of the losses: a read waits for the GPU
 
 
 class Schedule(Protocol):
@@ -310,8 +310,8 @@ class Trainer:
     def train_step(self, batch: Batch, done: float, also: Mapping[str, float] | None = None) -> dict[str, Tensor]:
         """One optimiser step; returns the loss and its parts, detached scalars. also: further values to log.
 
-        On a GPU nothing in it waits for the device: a gradient that is not finite is left out there, and found out
-        about at the next look at the losses. On a CPU it ends the training. Raises TrainingError.
+        On a GPU nothing in it waits for the device: a gradient that is not finite is left out there, and noticed when
+        the losses are read next. On a CPU it ends the training. Raises TrainingError.
         """
         rank, world = self.fabric.global_rank, self.fabric.world_size
         drawn = 0 if self.config.overfit else self.step
@@ -371,8 +371,8 @@ class Trainer:
     def _now_and_then(self, curves: Curves) -> None:
         ended = self._share() >= 1
         logged = self.step % self.config.log == 0 or ended
-        if logged or self.seconds - self.shown >= SHOWN:
-            self._look(curves if logged else None)
+        if logged or self.seconds - self.shown >= READ_EVERY:
+            self._read_losses(curves if logged else None)
         self.score = math.nan
         due = 0 < self.config.export_seconds <= self.seconds - self.exported
         if self.step % self.config.validate == 0 or ended:
@@ -383,8 +383,8 @@ class Trainer:
             self.save()
             self.exported = self.seconds
 
-    def _look(self, curves: Curves | None) -> None:
-        """At the losses, which waits for the device."""
+    def _read_losses(self, curves: Curves | None) -> None:
+        """Read the losses, which waits for the device."""
         self.shown, means = self.seconds, self.means
         if self.running.failed is not None and float(self.running.failed) > PATIENCE:
             self._check_finite(math.nan, math.nan)

@@ -1,7 +1,7 @@
 """The paper's recipe: MV-Net and SV-Net trained together, end to end (section 3.4, equations 1 and 2).
 
-MV-Net's first estimate renders SV-Net's first sample, each of SV-Net's answers the next one, detached: SV-Net learns to
-mend what the networks get wrong. Where a first estimate is more than 25 degrees off, a sample with a small random
+MV-Net's first estimate renders SV-Net's first sample, each of SV-Net's answers the next one, detached: SV-Net learns
+to correct what the networks get wrong. Where a first estimate is more than 25 degrees off, a sample with a small random
 rotation takes its place.
 """
 

@@ -22,7 +22,7 @@ from posekit.geometry import Pose, fibonacci_sphere, random_rotation, rotation_b
 from posekit.mesh.model import ObjectModel
 from posekit.nets.mvnet import CELL, GRID, NONE
 from posekit.render import Renderer
-from posekit.synth.appearance import FADED, faded
+from posekit.synth.appearance import WASHED_OUT, washed_out
 from posekit.synth.light import random_light
 from posekit.train.data.augment import AugmentConfig, composed
 from posekit.zoom import zoom_to_box
@@ -112,11 +112,11 @@ def training_bank(
 
     around: where given, only config.drawn of the directions are drawn, those nearest to the scenes' first.
     """
-    look = faded(model, str(rng.choice(FADED)), rng) if rng.random() < config.plain else model
+    coloured = washed_out(model, str(rng.choice(WASHED_OUT)), rng) if rng.random() < config.plain else model
     directions = fibonacci_sphere(config.views)
     if len(around):
         directions = directions[_near_directions(directions, around, config, rng)]
-    return ViewBank.of(model, renderer, directions, look)
+    return ViewBank.of(model, renderer, directions, coloured)
 
 
 def _near_directions(
@@ -154,7 +154,7 @@ def render_queries(
     renderer: Renderer, model: ObjectModel, count: int, config: QueryConfig, rng: Rng
 ) -> list[QueryScene]:
     """At most ``count`` crops of an object from all sides; those in which hardly anything is seen are left out."""
-    look = faded(model, str(rng.choice(FADED)), rng) if rng.random() < config.plain_scene else model
+    coloured = washed_out(model, str(rng.choice(WASHED_OUT)), rng) if rng.random() < config.plain_scene else model
     whole = Camera.from_fov(0.8, 640, 480)
     outline = model.hull_ctr
     poses, cameras = [], []
@@ -167,7 +167,7 @@ def render_queries(
         cameras.append(zoom.camera)
     T_ctr_obj = model.T_ctr_obj
     placed = [pose @ T_ctr_obj for pose in poses]
-    drawn = renderer.render(look, placed, cameras, light=[random_light(rng) for _ in range(count)], coords=False)
+    drawn = renderer.render(coloured, placed, cameras, light=[random_light(rng) for _ in range(count)], coords=False)
     h, w = config.cells
     cells = renderer.render(model, placed, [c.resized(w, h) for c in cameras], rgb=False)
     scenes = []
