@@ -1,4 +1,4 @@
-"""Camera: the only place that knows half pixels and OpenGL's clip space."""
+"""Camera: the only place with half-pixel offsets and OpenGL's clip space."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ PosekitError
 ├── OutputError       a folder or file that cannot be written, or would be overwritten
 ├── WeightsError      weights that are missing, damaged or of another preset
 ├── RenderError       no usable OpenGL, or a rendering that failed
-└── TrainingError     a training that cannot go on
+└── TrainingError     a training that cannot continue
 """
 
 
@@ -55,4 +55,4 @@ class RenderError(PosekitError):
 
 
 class TrainingError(PosekitError):
-    """A training that cannot go on."""
+    """A training that cannot continue."""

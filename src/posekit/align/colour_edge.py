@@ -57,7 +57,7 @@ class Colours:
         return np.asarray(inside / (inside + outside), np.float32)
 
     def posterior(self, image: NDArray[np.uint8]) -> FArray:
-        """The chance (...) that a pixel of this colour is the object's; image: uint8 RGB (..., 3)."""
+        """The probability (...) that a pixel of this colour is the object's; image: uint8 RGB (..., 3)."""
         return np.asarray(self.chance[_index(image)], np.float32)
 
     def seen(self, view: View) -> Mask:
@@ -114,7 +114,7 @@ def outline_lines(
     view: View, drawn: View, colours: Colours, seen: Mask, center: Array, outline: Outline | None = None
 ) -> Lines | None:
     """Where the outline of ``drawn`` (mask and coords) should lie in a frame's crop of the same camera; None where too
-    little of it can be told. seen: (H, W), what the crop shows of the object: outlines elsewhere are not used.
+    little of it can be found. seen: (H, W), what the crop shows of the object: outlines elsewhere are not used.
     center: (3,), the model's. outline: of ``drawn.mask``, where it is known already."""
     assert drawn.mask is not None and drawn.coords is not None
     pixels, normals = outline or find_outline(drawn.mask)

@@ -49,7 +49,7 @@ class MaskEdgeConfig:
 @dataclass(frozen=True, eq=False)
 class MaskEdgeFit:
     """covered: how much of the rendered outline has the mask's near it, 0 to 1. share: how much of that lies within a
-    pixel of it. turn_std: standard deviation of the rotation, radians, as far as outline and given pose tell."""
+    pixel of it. turn_std: standard deviation of the rotation, radians, from the outline and the given pose."""
 
     T_cam_obj: Pose
     covered: float

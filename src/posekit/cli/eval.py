@@ -49,7 +49,7 @@ def evaluate(
     ] = None,
     split: Annotated[str | None, typer.Option(help="Folder with the scenes.", rich_help_panel=DATA)] = None,
     units: Annotated[
-        Units, typer.Option(help="Of the meshes; auto: BOP's mm, or what models_info.json tells.", rich_help_panel=DATA)
+        Units, typer.Option(help="Of the meshes; auto: BOP's mm, or what fits models_info.json.", rich_help_panel=DATA)
     ] = "auto",
     objects: Annotated[
         str | None, typer.Option(metavar="1,9|ape,duck", help="Only these objects.", rich_help_panel=DATA)

@@ -141,7 +141,7 @@ def track(
 
 
 class _Counts:
-    """What became of the frames."""
+    """Counts of frames and of poses."""
 
     def __init__(self) -> None:
         self.used = 0

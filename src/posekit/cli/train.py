@@ -252,7 +252,9 @@ def detector(
     distractors: Annotated[
         list[Path] | None,
         typer.Option(
-            metavar="DIR", help="A folder of meshes that lie about, not to be found.", rich_help_panel=SOURCES
+            metavar="DIR",
+            help="A folder of further meshes for the scenes, not to be detected.",
+            rich_help_panel=SOURCES,
         ),
     ] = None,
     units: MeshUnitsOption = None,

@@ -89,7 +89,7 @@ class BopDataset:
     (``scene_camera_photoneo.json``, ``rgb_photoneo/``); the only sensor needs no name. targets: a test's list of
     images and objects, by default the first ``SPLIT_targets_*.json`` (bop19 before others) in the folder; where there
     is one, `images` and `instances` keep to it. Pass ``targets=None`` to see everything. units: of the meshes; auto is
-    BOP's mm, or what the stated diameter tells. Raises InputError where the layout is not there.
+    BOP's mm, or what fits the stated diameter. Raises InputError where the layout is not there.
     """
 
     def __init__(

@@ -3,7 +3,7 @@
 A class-agnostic Mask R-CNN proposes instances of anything, in more than one size of the picture. Each is
 compared with the mesh: by ImageNet's features over the silhouette, by their median chroma, and, the likeliest,
 by the template search that also gives first poses (silhouette and normalised colour).
-docs/decisions tells what each is worth.
+What each contributes is measured in docs/decisions.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ ANY = "novel"  # the name of the shipped detector
 SIDE = 96  # pixels of the pictures whose features are compared
 LEVELS = {"2": 16, "3": 32}  # of the features, and their strides
 MARGIN = 1.1
-WEIGHT, USUAL = 20.0, 0.56  # of an object's similarity, and the one that says nothing: docs/decisions/0015
+WEIGHT, USUAL = 20.0, 0.56  # of an object's similarity, and the similarity that changes nothing: docs/decisions/0015
 
 
 @dataclass(frozen=True)
@@ -266,14 +266,14 @@ class SimilarityDetector:
         return kept
 
 
-def with_similarity(chance: float, similarity: float) -> float:
-    """A chance that also says how much a thing looks like the mesh: docs/decisions/0015."""
-    return shifted(chance, WEIGHT * (similarity - USUAL))
+def with_similarity(probability: float, similarity: float) -> float:
+    """A probability that also depends on the similarity to the mesh: docs/decisions/0015."""
+    return shifted(probability, WEIGHT * (similarity - USUAL))
 
 
-def shifted(chance: float, shift: float) -> float:
-    """A chance whose log odds are shifted; 0 and 1 stay."""
-    return chance if not 0 < chance < 1 else 1 / (1 + (1 / chance - 1) * math.exp(-shift))
+def shifted(probability: float, shift: float) -> float:
+    """A probability whose log odds are shifted; 0 and 1 stay."""
+    return probability if not 0 < probability < 1 else 1 / (1 + (1 / probability - 1) * math.exp(-shift))
 
 
 def _chroma(pictures: Sequence[View]) -> FArray:

@@ -42,7 +42,7 @@ class Detector(Protocol):
 class BoxPrompt:
     """A box round the object, edges (x0, y0, x1, y1) in pixels.
 
-    mask_from: "none" (first poses need no mask), "grabcut" or "filled" (the box itself). Where GrabCut's answer cannot
+    mask_from: "none" (first poses need no mask), "grabcut" or "filled" (the box itself). Where GrabCut's result cannot
     be the object's silhouette, the filled box is taken, and the detection's ``source`` says "box+filled" instead of
     "box+grabcut".
     """

@@ -42,8 +42,8 @@ class SearchOptions:
 
     @classmethod
     def usual(cls, detections: Sequence[Detection]) -> SearchOptions:
-        """By who says where the objects are. What a person says is taken as it is; what another program says gives all
-        instances that do not overlap; a detector's detections must be confirmed by the rendering."""
+        """By the source of the detections. A person's are taken as they are; another program's give all instances that
+        do not overlap; a detector's detections must be confirmed by the rendering."""
         sources = [detection.source for detection in detections]
         if sources and all(source.given for source in sources):
             return cls(0, 0.0, 1.0 if all(source.by_hand for source in sources) else 0.5)

@@ -204,7 +204,7 @@ def with_colour_edge(
 def predicted_angle(T_cam_obj: Pose, prediction: PairPrediction, updated: Pose | None, update: str) -> float:
     """The rotation error (radians) that the network sees in a pose.
 
-    The angle head's answer; where correspondences move the pose, at least the turn that they ask for: a small angle
+    The angle head's output; where correspondences move the pose, at least the turn that they ask for: a small angle
     beside a large correction is no convergence.
     """
     if update == "regression" or updated is None:
@@ -213,7 +213,7 @@ def predicted_angle(T_cam_obj: Pose, prediction: PairPrediction, updated: Pose |
 
 
 class _Loop:
-    """One hypothesis on its way."""
+    """One hypothesis during refinement."""
 
     def __init__(self, start: Pose) -> None:
         self.pose = start

@@ -1,4 +1,4 @@
-"""Estimates against truths, vectorised over each object: errors and what they are worth in every measure."""
+"""Estimates against truths, vectorised over each object: errors, and their value in every measure."""
 
 from __future__ import annotations
 
@@ -239,7 +239,7 @@ def _symmetric_error(est: Array, gt: Array, symmetries: Sequence[Pose]) -> tuple
 
 
 def _hits(errors: Mapping[str, Array], diameter: float) -> dict[str, Array]:
-    """What each case is worth in the measures that follow from its errors."""
+    """Each case's value in the measures that follow from its errors."""
     hits = {}
     for n in LEVELS:
         for suffix in ("", "_sym"):

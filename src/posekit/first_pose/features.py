@@ -295,7 +295,7 @@ def _robust_pose(points: Array, pixels: Array, camera: Camera, error: float, see
     params.loMethod, params.randomGeneratorState, params.isParallel = cv2.LOCAL_OPTIM_INNER_LO, seed, False
     try:
         fitted, _, turn, t, _ = cv2.solvePnPRansac(points, pixels, camera.K, None, params=params)
-    except cv2.error:  # its answer to degenerate matches
+    except cv2.error:  # raised for degenerate matches
         return None
     if not fitted or not np.isfinite(turn).all() or not np.isfinite(t).all():
         return None

@@ -198,7 +198,7 @@ def _exif(image: Image.Image) -> dict[int, Any]:
     try:
         with warnings.catch_warnings(action="ignore"):
             return dict(image.getexif())
-    except Exception:  # Pillow raises what its parser stumbles over
+    except Exception:  # Pillow's parsers raise many kinds of errors
         return {}
 
 
@@ -295,7 +295,7 @@ def camera_from_exif(path: str | Path, size: Size) -> Camera | None:
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
             exif = image.getexif().get_ifd(0x8769)
-    except Exception:  # Pillow raises what its parser stumbles over, and metadata never stop a good picture
+    except Exception:  # Pillow's parsers raise many kinds of errors, and metadata never stop a good picture
         return None
     longer, shorter = max(size), min(size)
     taken = sorted((_positive(exif.get(0xA002)), _positive(exif.get(0xA003))))

@@ -95,7 +95,9 @@ def carried_uvs(
     _, under = KDTree(corners.mean(axis=1)).query(new.mean(axis=1))
     origin, first, second = np.moveaxis(corners[under].astype(np.float64), 1, 0)
     sides = np.stack([first - origin, second - origin], axis=2)  # (F', 3, 2)
-    shares = np.einsum("fij,fkj->fki", np.linalg.pinv(sides), new - origin[:, None]).clip(-4, 4)  # a sliver's explode
+    shares = np.einsum("fij,fkj->fki", np.linalg.pinv(sides), new - origin[:, None]).clip(
+        -4, 4
+    )  # unbounded for slivers
     start = corner_uvs[under, 0].astype(np.float64)
     across = corner_uvs[under, 1:].astype(np.float64) - start[:, None]
     uvs = (start[:, None] + shares @ across).reshape(-1, 2)

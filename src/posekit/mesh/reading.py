@@ -128,7 +128,7 @@ def read_parts(path: Path) -> list[Part]:
         parts = [] if problem else _parts(scene, path.name)
     except MeshError:
         raise
-    except Exception as error:  # trimesh raises whatever its parsers stumble over
+    except Exception as error:  # trimesh's parsers raise many kinds of errors
         problem = assets.problem or f"cannot be read as {kind[1:].upper()} ({type(error).__name__}: {error})"
         raise MeshError(f"{path.name} {problem}. Export it again.") from error
     if problem:
@@ -158,7 +158,7 @@ def _too_many_pixels(image: Image.Image) -> str | None:
 
 
 def _reading_options(path: Path, data: bytes) -> dict[str, Any]:
-    """What trimesh has to be told about a file's contents."""
+    """Options for trimesh that depend on a file's contents."""
     kind = path.suffix.lower()
     if kind == ".ply":
         # texture coordinates at a face's corners need vertices split; at vertices they must stay as they are

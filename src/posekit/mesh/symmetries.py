@@ -150,7 +150,7 @@ def _turn_about(R: Floats, point: Floats) -> Pose:
 def _group(turns: Sequence[Floats], text: str) -> list[Floats]:
     """All products of rotations (3, 3), without the identity."""
     found = [np.eye(3)]
-    for known in found:  # grows while it is walked through
+    for known in found:  # grows during the loop
         for turn in turns:
             product = turn @ known
             if np.abs(np.stack(found) - product).max(axis=(1, 2)).min() > 1e-6:

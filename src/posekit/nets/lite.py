@@ -1,7 +1,7 @@
 """The preset that a laptop runs: a shared tower, exchange between both crops, matching, a dense head.
 
 A shared tower describes the observed and the rendered crop, another one the two laid over each other, with the rendered
-mask, normals and relief. No mask of the observed object is an input: its visible and its whole silhouette are answers.
+mask, normals and relief. No mask of the observed object is an input: its visible and its whole silhouette are outputs.
 Exchange blocks (bottleneck convolutions within a crop, attention across the two) tell every cell of one what the other
 shows. Matching all pairs of cells, with the further choice that a cell is not shown, gives a first flow (GMFlow's way:
 Xu et al., 2022) and that a rigid motion; where this motion says that both crops show the same, a head at 1/4
@@ -312,7 +312,7 @@ class LiteSVNet(nn.Module):
 
 
 def facts_of(motion: Motion, on: Tensor, log_scale: Tensor, visibility: Tensor) -> Tensor:
-    """What the dense answer says as a whole, (B, FACTS), of the size of 1: the motion's turn (axis times sine, cosine)
+    """A summary of the dense output, (B, FACTS), of the size of 1: the motion's turn (axis times sine, cosine)
     and shift, and over the object the mean log scale and visibility."""
     R, t = motion.R, motion.t
     turn = torch.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], dim=1)

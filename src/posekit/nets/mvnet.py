@@ -151,7 +151,7 @@ class Block(nn.Module):
 
 
 class Code(nn.Module):
-    """What is compared to choose views: (N, D, h, w) -> a unit vector (N, 128) that knows the layout roughly."""
+    """What is compared to choose views: (N, D, h, w) -> a unit vector (N, 128) that keeps the rough layout."""
 
     def __init__(self, channels: int, cells: tuple[int, int]) -> None:
         super().__init__()

@@ -1,4 +1,5 @@
-"""Meshes that look other than the real object: CAD files have no colours, scans have few, paint and labels differ.
+"""Meshes whose appearance differs from the real object's: CAD files have no colours, scans have few, paint and labels
+differ.
 
 A refiner must not trust the mesh's appearance, so in a part of the training pairs the rendered and the observed side
 show two variants of one mesh.

@@ -13,7 +13,7 @@ from posekit.io.load import load_image
 from posekit.synth.procedural import noise_image, random_colour, random_texture
 
 PICTURES = (".jpg", ".jpeg", ".png", ".webp")
-SHELF = 48  # procedural textures of a data set, made once
+TEXTURES = 48  # procedural textures of a data set, made once
 
 Image = NDArray[np.uint8]
 Rng = np.random.Generator
@@ -44,7 +44,7 @@ class Backdrops:
 
     def texture(self, rng: Rng) -> Image:
         """One of the data set's procedural textures."""
-        k = int(rng.integers(SHELF))
+        k = int(rng.integers(TEXTURES))
         if k not in self._textures:
             self._textures[k] = random_texture(np.random.default_rng([self.seed, 1, k]))
         return self._textures[k]

@@ -1,4 +1,4 @@
-"""Pictures that are joined by depth: what is nearer is in front, and each pixel knows whose it is."""
+"""Pictures that are joined by depth: what is nearer is in front, and each pixel has a label."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def overlap(size: tuple[int, int], left: int, top: int, part: tuple[int, int]) -
 
 class Canvas:
     """The picture so far. image: uint8 (H, W, 3), painted in place. depth: float32 (H, W), metres, 0 where nothing
-    is. labels: int16 (H, W), whose each pixel is, 0 at first."""
+    is. labels: int16 (H, W), the number of the part that is seen, 0 at first."""
 
     def __init__(self, image: Image, depth: Depth | None = None) -> None:
         self.image = image

@@ -51,7 +51,7 @@ class TabletopConfig:
     spread: tuple[float, float] = (1.0, 3.0)  # radius in which objects lie
     shadow: float = 0.7  # share of tables with shadows
     paint: float = 1.0  # how far the objects' paint strays from the meshes', 0 = not at all
-    scraps: tuple[int, int] = (0, 0)  # least and most parts cut out of photographs that lie about behind the objects
+    scraps: tuple[int, int] = (0, 0)  # least and most parts cut out of photographs behind the objects
 
     def __post_init__(self) -> None:
         if not 0 <= self.objects[0] <= self.objects[1] or not 0 <= self.distractors[0] <= self.distractors[1]:

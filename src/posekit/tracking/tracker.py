@@ -63,7 +63,7 @@ class TrackConfig:
     # pose to points and outline, both degrees
     restart_deg: float = 25.0
     still_deg: float = 0.0
-    converged_deg: float = 2.0  # the predicted angle below which an estimate says that it converged
+    converged_deg: float = 2.0  # the predicted angle below which an estimate counts as converged
     again_deg: float = 8.0
     iterations: int = 1  # comparisons of a frame at most; a second one follows a turn of more than ``again_deg``
     # where a frame's comparison starts: where followed points lead ("points"), the share ``prior`` of the last motion
@@ -104,7 +104,7 @@ class TrackConfig:
 
 @dataclass(frozen=True, eq=False)
 class Tracked:
-    """What a frame says about the object. state: "tracked", "restarted" (a new first pose) or "lost". estimate: None
+    """The result for a frame. state: "tracked", "restarted" (a new first pose) or "lost". estimate: None
     where it is lost; its score is the share of its silhouette that has the object's colours."""
 
     state: str

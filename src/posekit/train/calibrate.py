@@ -77,7 +77,7 @@ def passed_poses(
 
 def calibrate(networks: Networks, cases: Sequence[Case], renderer: Renderer, tell: Tell | None = None) -> Networks:
     """The networks with an angle head whose median is right on the poses of the loop. Raises TrainingError where there
-    are too few cases or the network answers nothing finite."""
+    are too few cases or the network's outputs are not finite."""
     passed = passed_poses(networks, cases, renderer, tell=tell)
     if len(passed.angle) < LEAST or not np.isfinite(passed.features).all():
         raise TrainingError(

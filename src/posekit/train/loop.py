@@ -178,7 +178,7 @@ def make_fabric(config: Schedule) -> Any:
         from lightning_fabric.plugins.environments.torchelastic import TorchElasticEnvironment
     except ImportError as error:
         raise ConfigError("training needs Lightning Fabric: pip install 'posekit[train]'.") from error
-    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # it tells every run what was asked for
+    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # it repeats the configuration in every run
     machine = config.machine
     accelerator = machine.accelerator
     if accelerator == "auto":

@@ -1,6 +1,6 @@
 """The paper's recipe: MV-Net and SV-Net trained together, end to end (section 3.4, equations 1 and 2).
 
-MV-Net's first estimate renders SV-Net's first sample, each of SV-Net's answers the next one, detached: SV-Net learns
+MV-Net's first estimate renders SV-Net's first sample, each of SV-Net's outputs the next one, detached: SV-Net learns
 to correct what the networks get wrong. Where a first estimate is more than 25 degrees off, a sample with a small random
 rotation takes its place.
 """
@@ -131,7 +131,7 @@ class PaperModule(nn.Module):
         return replace(crop, observed=rgba_of(observed), rendered=rgba_of(drawn))
 
     def _next(self, scene: _Scene, crop: _Crop, delta: PoseDelta, rng: np.random.Generator) -> Pose:
-        """The next iteration's start: the answer, turned back into the scene's frame, unless it is lost."""
+        """The next iteration's start: the output, turned back into the scene's frame, unless it is lost."""
         updated = apply_delta(crop.source, delta, crop.zoom.camera.fx)
         found = Pose.rotation(crop.zoom.R_view_cam.T) @ updated
         return found if is_near(found, scene, np.pi) else disturbed_pose(scene.truth, scene.model.diameter, rng)

@@ -77,7 +77,7 @@ class Frontal:
 
 @dataclass(frozen=True, eq=False)
 class BoxSample:
-    """What MV-Net is given and should answer. observed: uint8 (H, W, 4), the crop round a detection's box. camera:
+    """MV-Net's input and its target. observed: uint8 (H, W, 4), the crop round a detection's box. camera:
     the crop's. R_crop_view: (3, 3), from the scene's frame into the crop's. delta: from the frontal view to the
     truth."""
 

@@ -79,7 +79,7 @@ class QueryScene:
 
 @dataclass(frozen=True, eq=False)
 class QuerySample:
-    """A query and its answers for k templates of a group of K. observed: uint8 (H, W, 3). chosen: int64 (k,), in the
+    """A query and its targets for k templates of a group of K. observed: uint8 (H, W, 3). chosen: int64 (k,), in the
     group. cell: int64 (k, h * w), 64 = none. offset: float32 (k, 2, h * w), from the cell's middle in cells. turn:
     float32 (k, 2), cosine and sine of the turn in the picture from template to query. facing: (k,), cosine between
     directions of view. near: (k,) and near_all: (K,), 1 = the template is the truth. silhouettes: bool (2, H/4, W/4),
