@@ -469,21 +469,21 @@ def test_proposals_are_compared_with_the_mesh(renderer: Renderer, untrained: Tra
         NovelDetector(TrainedDetector(dataclasses.replace(TINY, classes=("cup",)), untrained.network), renderer)
 
 
-def test_looks_in_two_sizes_are_joined(untrained: TrainedDetector, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_detections_in_two_sizes_are_joined(untrained: TrainedDetector, monkeypatch: pytest.MonkeyPatch) -> None:
     masks = np.zeros((3, 60, 80), bool)
     masks[:, 5:20, 5:20] = True
-    looks = iter(
+    outputs = iter(
         [
             Found(np.array([[4.0, 4, 20, 20], [40, 30, 60, 50]]), np.array([0, 0]), np.array([0.9, 0.4]), masks[:2]),
             Found(np.array([[6.0, 4, 22, 20], [4.0, 4, 20, 20]]), np.array([0, 1]), np.array([0.3, 0.2]), masks[:2]),
         ]
     )
-    monkeypatch.setattr(maskrcnn, "find", lambda *_, **__: next(looks))
+    monkeypatch.setattr(maskrcnn, "find", lambda *_, **__: next(outputs))
     image = np.zeros((60, 80, 3), np.uint8)
     found = maskrcnn.find_augmented(untrained, image, ((1.0, False), (2.0, False)), min_score=0.15)
     assert found.scores.tolist() == pytest.approx([0.6, 0.2]) and found.labels.tolist() == [0, 0]
     np.testing.assert_allclose(found.boxes, [[4.5, 4, 20.5, 20], [40, 30, 60, 50]], atol=1e-4)
-    looks = iter([Found(np.zeros((0, 4)), np.zeros(0, np.int64), np.zeros(0), masks[:0])] * 2)
+    outputs = iter([Found(np.zeros((0, 4)), np.zeros(0, np.int64), np.zeros(0), masks[:0])] * 2)
     assert not len(maskrcnn.find_augmented(untrained, image, ((1.0, False), (2.0, False)), min_score=0.15).scores)
 
 
@@ -515,7 +515,9 @@ def test_what_looks_like_the_mesh_counts_for_more(renderer: Renderer) -> None:
     assert [d.box for d in finder.detect(view, [model])] == [boxes[0]]
 
 
-def test_a_mirrored_look_is_mirrored_back(untrained: TrainedDetector, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_mirrored_picture_shows_is_mirrored_back(
+    untrained: TrainedDetector, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What stands for the network finds the picture's bright part."""
 
     def bright(_: object, image: np.ndarray, **__: object) -> Found:
@@ -527,11 +529,11 @@ def test_a_mirrored_look_is_mirrored_back(untrained: TrainedDetector, monkeypatc
     monkeypatch.setattr(maskrcnn, "find", bright)
     image = np.zeros((60, 80, 3), np.uint8)
     image[10:30, 5:25] = 200
-    for looks in (((1.0, True),), ((1.0, False), (1.5, True))):
-        found = maskrcnn.find_augmented(untrained, image, looks, min_score=0.5)
+    for augmentations in (((1.0, True),), ((1.0, False), (1.5, True))):
+        found = maskrcnn.find_augmented(untrained, image, augmentations, min_score=0.5)
         np.testing.assert_allclose(found.boxes, [[5, 10, 25, 30]], atol=1e-4)
         np.testing.assert_array_equal(found.masks[0], image[..., 0] > 100)
-        assert found.scores.tolist() == pytest.approx([0.8]), "one instance, seen by every look"
+        assert found.scores.tolist() == pytest.approx([0.8]), "one instance, found in every version"
 
 
 # --- commands -----------------------------------------------------------------------------------------------------

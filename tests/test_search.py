@@ -179,7 +179,7 @@ def test_what_is_kept_depends_on_who_says_where_the_object_is() -> None:
     for source in (Source.BOX, Source.GRABCUT, Source.FILLED, Source.MASK):
         assert kept(fixed, source) == [0.8, 0.6, 0.5, 0.1], "as a person says"
     assert kept(fixed, Source.FILE) == [0.8, 0.5, 0.1], "all that do not overlap"
-    assert kept(fixed, Source.NOVEL) == kept(fixed, Source.TRAINED) == [0.8], "the best one, borne out"
+    assert kept(fixed, Source.NOVEL) == kept(fixed, Source.TRAINED) == [0.8], "the best one, confirmed"
     assert SearchOptions.usual([]) == SearchOptions()
     assert SearchOptions.usual([Detection(BOXES[0]), Detection(BOXES[1], source=Source.FILE)]).overlap == 0.5
     assert SearchOptions.usual([Detection(BOXES[0]), Detection(BOXES[1], source=Source.TRAINED)]).min_score == 0.5

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from posekit.camera import box_mask
 from posekit.synth.procedural import noise_image, photo_crop, random_colour
 from posekit.train.data.pairs import ANCHOR, Pair
 
@@ -282,9 +283,8 @@ def disturb_mask(mask: NDArray[np.bool_], config: AugmentConfig, rng: Rng) -> ND
         return np.zeros_like(mask)
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     if kind < config.no_mask + config.box_mask:
-        box = np.zeros_like(mask)
-        box[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] = True
-        return box
+        box = float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1)
+        return box_mask(box, (mask.shape[1], mask.shape[0]))
     out: Image = mask.astype(np.uint8)
     if kind < config.no_mask + config.box_mask + config.cut_mask:
         centre = [int(rng.choice(columns)), int(rng.choice(rows))]
