@@ -130,10 +130,10 @@ def outline_lines(
     places = pixels + normals * mean[:, None]
     there, _ = _pixels(places, view)
     near = cv2.dilate(seen.astype(np.uint8), np.ones((5, 5), np.uint8))[there[:, 1], there[:, 0]] > 0
-    # the edge of what hides the object is taken for its outline, and draws it along
+    # the edge of what hides the object would be taken for its outline
     hidden = cv2.erode((drawn.mask & ~seen).astype(np.uint8), _disc(HIDDEN))
-    spoilt = cv2.dilate(hidden, _disc(HIDDEN + BESIDE))[pixels[:, 1].astype(int), pixels[:, 0].astype(int)] > 0
-    usable = near & ~spoilt & (sigma < 0.5 * REACH) & (np.abs(mean) < REACH - 1.5)
+    near_occluder = cv2.dilate(hidden, _disc(HIDDEN + BESIDE))[pixels[:, 1].astype(int), pixels[:, 0].astype(int)] > 0
+    usable = near & ~near_occluder & (sigma < 0.5 * REACH) & (np.abs(mean) < REACH - 1.5)
     usable &= inside[:, TAIL:-TAIL].mean(axis=1) > 0.9
     if usable.sum() < LEAST:
         return None

@@ -154,8 +154,8 @@ def _equations(crop: _Crop, start: Pose, grown: float, config: MaskEdgeConfig) -
 
 def _outline(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """The mask's outermost pixels (H, W), but for those at the picture's edge."""
-    worn = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    outline = mask & ~worn
+    eroded = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    outline = mask & ~eroded
     outline[[0, -1]] = outline[:, [0, -1]] = False
     return outline
 
