@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from posekit.geometry import Pose, so3_exp
+from posekit.nets.weights import build, save_networks
 from posekit.render import Renderer
-from posekit.synth.example import Example, make_example
+from posekit.synth.example import Example, make_example, ply
 
 Array = NDArray[np.float64]
 
@@ -44,3 +48,14 @@ def renderer() -> Renderer:
 def example(renderer: Renderer) -> Example:
     """The locomotive of posekit demo with its photograph and its true pose."""
     return make_example(renderer)
+
+
+@pytest.fixture(scope="session")
+def example_folder(example: Example, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The example as files (photo.png, toy.ply, pose.json), and weights that nobody trained (untrained)."""
+    folder = tmp_path_factory.mktemp("example")
+    cv2.imwrite(str(folder / "photo.png"), example.view.image[..., ::-1])
+    (folder / "toy.ply").write_text(ply(example.model))
+    (folder / "pose.json").write_text(json.dumps({"T_cam_obj": example.T_cam_obj.matrix.tolist()}))
+    save_networks(folder / "untrained", build("lite"), {"trained on": "nothing"})
+    return folder

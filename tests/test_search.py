@@ -25,7 +25,6 @@ from posekit.evaluate.stages import ImageStage
 from posekit.evaluate.truths import Truth, TruthReader
 from posekit.geometry import Pose
 from posekit.mesh.model import ObjectModel
-from posekit.nets.weights import build, save_networks
 from posekit.results import Detection, Estimate, Source
 from posekit.tracking.tracker import LOST, RESTARTED, Tracker
 from posekit.view import View
@@ -45,11 +44,9 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def weights(example_folder: Path) -> Path:
     """Weights that nobody trained."""
-    path = tmp_path_factory.mktemp("weights") / "untrained"
-    save_networks(path, build("lite"), {"trained on": "nothing"})
-    return path
+    return example_folder / "untrained"
 
 
 def truths(root: Path) -> list[Truth]:
