@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from objects import bracket, cuboid
-from posekit.camera import Camera
+from objects import CAMERA, bracket, cuboid
 from posekit.detect.novel import make_detector
 from posekit.first_pose import features, mesh_cache
 from posekit.first_pose.features import VERSION, FeatureModel, FeatureSearch
@@ -19,19 +18,12 @@ from posekit.mesh.model import ObjectModel
 from posekit.render import Light, Renderer
 from posekit.view import View
 
-CAMERA = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
-
 
 @pytest.fixture(scope="module", autouse=True)
 def cache(tmp_path_factory: pytest.TempPathFactory):  # type: ignore[no-untyped-def]
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         yield
-
-
-@pytest.fixture(scope="module")
-def renderer() -> Renderer:
-    return Renderer()
 
 
 def textured(seed: int = 0) -> ObjectModel:

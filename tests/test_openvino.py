@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from objects import bracket
-from posekit.camera import Camera
+from objects import CAMERA, bracket
 from posekit.errors import ConfigError
 from posekit.estimate.refine import compare, update_pose
 from posekit.geometry import Pose, so3_exp, view_rotation
@@ -24,8 +23,6 @@ from posekit.nets.runtime import Runtime
 from posekit.nets.weights import build, load_networks
 from posekit.render import Renderer
 from posekit.view import View
-
-CAMERA = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
 
 
 @pytest.fixture(scope="module")

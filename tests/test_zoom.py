@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from objects import bracket
+from objects import CAMERA, bracket
 from posekit.camera import Camera
 from posekit.geometry import Pose, view_rotation
 from posekit.zoom import box_window, frontal_camera, frontal_pose, zoom_to_box, zoom_to_pose
 
-CAMERA = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
 MODEL = bracket()
 HULL = MODEL.hull_ctr
 POSE = Pose(view_rotation([0.5, -1.0, 0.6]), np.array([0.1, -0.05, 0.7]))

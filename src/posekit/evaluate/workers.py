@@ -70,7 +70,7 @@ class _Pool:
         picture = next(left, None)
         if picture is not None:
             at[pipe] = picture
-            with suppress(BrokenPipeError):  # a dead worker is reported where its answer is awaited
+            with suppress(BrokenPipeError):  # a dead worker is reported where its result is awaited
                 pipe.send(picture)
 
     def _answer(self, pipe: Connection, picture: Picture) -> Record:

@@ -60,7 +60,7 @@ def has_fast_bfloat16(device: str) -> bool:
 
     if device == "cuda":
         return torch.cuda.is_bf16_supported()
-    ask: Any = getattr(torch.cpu, "get_capabilities", dict)  # older versions of torch do not tell
+    ask: Any = getattr(torch.cpu, "get_capabilities", dict)  # older versions of torch do not have it
     return bool(ask().get("amx_bf16"))
 
 

@@ -19,7 +19,7 @@ FArray = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
-    """The dense head's answer for one pair, on the anchors that lie on the rendered object.
+    """The dense head's output for one pair, on the anchors that lie on the rendered object.
 
     source: (N, 2) integer pixels (column, row) in the crop. target: (N, 2) pixel centres in the observed crop.
     scale_px: (N,), expected error of each. visible: (N,), probability that the observed picture shows it. weight: (N,),
@@ -35,7 +35,7 @@ class Correspondences:
 
 @dataclass(frozen=True, eq=False)
 class PairPrediction:
-    """What a network says about one pair. delta: from the rendered to the observed pose. angle: radians.
+    """A network's output for one pair. delta: from the rendered to the observed pose. angle: radians.
     silhouettes: float32 (2, H/4, W/4), how likely each 4x4 block of the observed crop shows the object, and would
     if nothing stood before it. score: in [0, 1], how near the pose is to the right one, for ranking hypotheses."""
 
@@ -55,7 +55,8 @@ class Predictor(Protocol):
     size: tuple[int, int]
     dense: bool
 
-    def predict(self, observed: Sequence[View], rendered: Sequence[View]) -> list[PairPrediction]: ...
+    def predict(self, observed: Sequence[View], rendered: Sequence[View]) -> list[PairPrediction]:
+        """A prediction for each pair of an observed and a rendered crop; both lists have the same length."""
 
 
 def unpack(arrays: Sequence[FArray | None], k: int, rendered: View) -> PairPrediction:
@@ -70,13 +71,13 @@ def unpack(arrays: Sequence[FArray | None], k: int, rendered: View) -> PairPredi
     assert silhouettes is not None and score is not None
     rows, columns = np.nonzero(rendered.mask[2::4, 2::4])
     source = np.stack([columns, rows], axis=1) * 4 + 2
-    visible, sure = (sigmoid(x[k][rows, columns].astype(np.float64)) for x in (visibility, certainty))
+    visible, certain = (sigmoid(x[k][rows, columns].astype(np.float64)) for x in (visibility, certainty))
     found = Correspondences(
         source=source,
         target=source + flow[k][:, rows, columns].T.astype(np.float64),
         scale_px=np.exp(log_scale[k][rows, columns].astype(np.float64)),
         visible=visible,
-        weight=visible * sure / max(float(sure.mean()), 1e-6) if len(rows) else visible,
+        weight=visible * certain / max(float(certain.mean()), 1e-6) if len(rows) else visible,
     )
     return PairPrediction(delta, bounded, found, sigmoid(silhouettes[k]), float(sigmoid(score[k])))
 

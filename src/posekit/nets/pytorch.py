@@ -29,6 +29,7 @@ class NetworkPredictor:
         self.dense = networks.dense
 
     def predict(self, observed: Sequence[View], rendered: Sequence[View]) -> list[PairPrediction]:
+        """A prediction for each pair of crops of the network's size, in one batch."""
         svnet, device = self.networks.svnet, self.device
         dense = isinstance(svnet, LiteSVNet)
         first = np.stack([to_input(v.image, None)[:3] if dense else to_input(v.image, v.mask) for v in observed])

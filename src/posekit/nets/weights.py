@@ -38,6 +38,7 @@ class Networks:
 
     @property
     def size(self) -> tuple[int, int]:
+        """(width, height) of the crops that the networks take, pixels."""
         return self.config.size
 
     @property

@@ -91,7 +91,7 @@ class SourceConfig:
     # recipe)
     bop: tuple[str, ...] = ()
     renders: float = 1.0  # weight of renderings beside them
-    # folders of meshes that lie about in a detector's scenes and are not to be found
+    # folders of further meshes for a detector's scenes, which are not to be detected
     distractors: tuple[str, ...] = ()
     backgrounds: str = ""  # a folder of photographs
     init: str = ""  # weights to start from; empty = none

@@ -50,7 +50,8 @@ class Case:
 @dataclass(frozen=True, eq=False)
 class CaseSource:
     """What renderings for cases are made of. models: in turn; none = new procedural objects. unlike, deformed: the
-    shares of cases whose mesh looks other than the object that is shown, or strays from it (`appearance.variants`)."""
+    shares of cases whose mesh has other colours than the object that is shown, or another shape
+    (`appearance.variants`)."""
 
     models: Sequence[ObjectModel]
     photos: Sequence[NDArray[np.uint8]]

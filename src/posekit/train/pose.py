@@ -193,6 +193,8 @@ def is_first() -> bool:
 
 
 def claim(out: Path, force: bool) -> None:
+    """Make ``out`` ready for a new training; force: delete a former one's checkpoints and logs there. Raises
+    OutputError where it is a file, or holds files and ``force`` is not given."""
     if out.exists() and not out.is_dir():
         raise OutputError(f"{out} is a file: --out names a folder.")
     if out.is_dir() and any(out.iterdir()):
