@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Iterator, Sequence
@@ -188,7 +187,7 @@ def _run(
             results = _step(trackers, frame, counts)
             seconds = time.perf_counter() - started
             for k, (tracker, result) in enumerate(zip(trackers, results, strict=True)):
-                lines.write(_line(frame, tracker.model.name, result) + "\n")
+                lines.write(_line(frame, tracker.model.name, result))
                 if result.estimate is not None:
                     if keep:
                         counts.poses.append(named_pose(result.estimate, frame.number, frame.seconds))
@@ -220,6 +219,8 @@ def _step(trackers: Sequence[Tracker], frame: Frame, counts: _Counts) -> list[Tr
 
 
 def _line(frame: Frame, name: str, result: Tracked) -> str:
+    from posekit.results import FRAME_SCHEMA, document_to_json
+
     pose, angle = result.T_cam_obj, result.angle
     entry: dict[str, Any] = {
         "frame": frame.number,
@@ -235,7 +236,7 @@ def _line(frame: Frame, name: str, result: Tracked) -> str:
         entry["seconds"] = frame.seconds
     if frame.problem:
         entry["problem"] = frame.problem
-    return json.dumps(entry, allow_nan=False)
+    return document_to_json(FRAME_SCHEMA, entry, indent=None)
 
 
 def _row(frame: Frame, obj_id: int, result: Tracked, seconds: float) -> str:
