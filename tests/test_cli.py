@@ -84,8 +84,16 @@ def test_every_command_has_help(command: str) -> None:
     assert "Usage" in result.stdout
 
 
-def test_version() -> None:
-    assert CliRunner().invoke(app, ["--version"]).stdout == f"posekit {__version__}\n"
+@pytest.mark.parametrize("command", [*sorted(get_command(app).commands), "train pose"])  # type: ignore[attr-defined]
+def test_every_command_shows_how_much_it_says(command: str) -> None:
+    shown = CliRunner().invoke(app, [*command.split(), "--help"]).stdout
+    assert all(word in shown for word in ("--quiet", "-q", "--verbose", "-v", "--debug"))
+    assert "<bool>" not in shown, "flags take no value"
+
+
+@pytest.mark.parametrize("flag", ["--version", "-V"])
+def test_version(flag: str) -> None:
+    assert CliRunner().invoke(app, [flag]).stdout == f"posekit {__version__}\n"
 
 
 # --- success ----------------------------------------------------------------------------------------------------
@@ -165,6 +173,20 @@ def test_what_is_not_reliable_says_so_first(
     assert first.startswith("toy: reliable:" if reliable else "toy: NOT RELIABLE:")
     assert "converged" not in found.stderr
     assert invoke(command, json="-").exit_code == 0, "it has to be asked for"
+
+
+def test_quiet_and_verbose(invoke: Invoke, monkeypatch: pytest.MonkeyPatch) -> None:
+    usual, quiet = (invoke("refine", None, *flags, camera=None, units="auto") for flags in ((), ("-q",)))
+    assert "note: toy.ply" in usual.stderr and "debug:" not in usual.stderr
+    assert "T_cam_obj" in quiet.stdout and "note:" not in quiet.stderr
+    assert "warning: photo.png: its camera is not known" in quiet.stderr
+    told = invoke("estimate", None, "--verbose", "--min-score", "0").stderr
+    for words in ("debug: loading the networks: ", "debug: toy: 5 first poses in ", "debug: toy: pose 1 of 5: score "):
+        assert words in told, told
+    front = CliRunner().invoke(app, ["-q", "estimate", "a.png", "--model", "b.ply", "--least", "0"])
+    assert front.exit_code == 1 and front.stderr.startswith("error:"), "before the command too; the notice is a note"
+    both = CliRunner().invoke(app, ["doctor", "-q", "-v"])
+    assert both.exit_code == 2 and "--quiet and --verbose" in both.stderr
 
 
 def test_json_on_standard_output_is_alone_there(invoke: Invoke, tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from posekit.cli.estimate import HypothesesOption, InitOption
+from posekit.cli.messages import progress_console
 from posekit.cli.options import (
     LOOP,
     OUTPUT,
@@ -211,11 +212,11 @@ def _noise(text: str) -> tuple[float, float, float, float]:
 @contextmanager
 def _progress() -> Iterator[Progress]:
     """A bar on a terminal."""
-    from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (TextColumn("pictures"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    console = progress_console()
+    with Progress(*columns, console=console, transient=True, disable=console.quiet) as bar:
         task = bar.add_task("pictures", total=None)
         yield lambda done, every: bar.update(task, completed=done, total=every)
 

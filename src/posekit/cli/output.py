@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from posekit.cli.messages import working
 from posekit.cli.options import NOT_RELIABLE
 from posekit.errors import OutputError
 from posekit.geometry import rotation_angle
@@ -118,9 +119,7 @@ class Destination:
     @contextmanager
     def working(self, what: str) -> Iterator[None]:
         """Show what is being done, on a terminal only."""
-        from rich.console import Console
-
-        with Console(stderr=True).status(f"{what} ..."):
+        with working(what):
             yield
 
     def deliver(

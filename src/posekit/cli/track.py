@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from posekit.cli.messages import progress_console
 from posekit.cli.options import (
     INPUT,
     LOOP,
@@ -294,12 +295,11 @@ def _recorder(path: Path, trackers: Sequence[Tracker], wanted: bool) -> Iterator
 @contextmanager
 def _bar(sequence: Frames) -> Iterator[Any]:
     """Frames a second, angle and state, live on a terminal."""
-    from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-    console = Console(stderr=True)
+    console = progress_console()
     columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with Progress(*columns, console=console, transient=True, disable=console.quiet) as bar:
         task = bar.add_task("", total=sequence.count)
         mean = 0.0
 

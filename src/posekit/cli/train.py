@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from posekit.cli.messages import Command, Group, progress_console
 from posekit.cli.options import ForceOption, Units
 from posekit.io.files import check_writable
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 SOURCES, SCHEDULE, MACHINE = "Sources", "Schedule", "Machine"
 
-train = typer.Typer(no_args_is_help=True, help="Train networks from meshes.")
+train = typer.Typer(cls=Group, no_args_is_help=True, help="Train networks from meshes.")
 
 
 @train.callback()
@@ -26,7 +27,7 @@ def _train() -> None:
     """Train networks from meshes."""
 
 
-@train.command("pose")
+@train.command("pose", cls=Command)
 def pose(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the weights, curves and checkpoints.")],
     model: Annotated[
@@ -129,7 +130,7 @@ def pose(
         typer.echo(f"weights: {out}; use them with: posekit estimate --weights {out}")
 
 
-@train.command("angle")
+@train.command("angle", cls=Command)
 def angle(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the weights.")],
     weights: Annotated[
@@ -216,12 +217,11 @@ def _report(rows: list[dict[str, str]]) -> str:
 @contextmanager
 def _bar() -> Iterator[Show]:
     """A progress bar on a terminal; elsewhere nothing."""
-    from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     columns = (BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn(), TimeRemainingColumn())
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    console = progress_console()
+    with Progress(*columns, console=console, transient=True, disable=console.quiet) as bar:
         task = bar.add_task("starting", total=1.0)
 
         def show(progress: Any) -> None:
@@ -232,7 +232,7 @@ def _bar() -> Iterator[Show]:
         yield show
 
 
-@train.command("detector")
+@train.command("detector", cls=Command)
 def detector(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the weights, curves and checkpoints.")],
     models: Annotated[
@@ -317,7 +317,7 @@ def detector(
             rows = train_detector(changed(chosen, _given(asked), "the command line"), out, show, force)
     if rows:
         typer.echo(_detector_report(rows))
-        typer.echo(f"weights: {out}; use them with: posekit detect IMAGE --weights {out}")
+        typer.echo(f"weights: {out}; use them with: posekit detect IMAGE --detector {out}")
 
 
 def _detector_report(rows: list[dict[str, str]]) -> str:
