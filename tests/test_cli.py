@@ -344,6 +344,17 @@ def test_render_views(invoke: Invoke, example: Example, tmp_path: Path) -> None:
     np.testing.assert_array_equal(drawn.mask, mask > 0)
 
 
+def test_render_views_and_doctor_as_json(invoke: Invoke, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = invoke("render-views", None, views=2, size="16x16", out="views", units="m", json="-")
+    assert json.loads(found.stdout) == json.loads((tmp_path / "views" / "views.json").read_text())
+    assert "contact_sheet.png" in found.stderr
+    monkeypatch.setattr(doctor, "examine", lambda: [doctor.Finding("OpenGL", "none", "problem", "install it")])
+    report = CliRunner().invoke(app, ["doctor", "--json", "-"])
+    entry = {"topic": "OpenGL", "text": "none", "state": "problem", "todo": "install it"}
+    assert json.loads(report.stdout)["findings"] == [entry] and json.loads(report.stdout)["problems"] == 1
+    assert report.exit_code == 1 and "-> install it" in report.stderr
+
+
 def test_demo(invoke: Invoke, folder: Path, tmp_path: Path) -> None:
     arguments = ["demo", "--weights", str(folder / "untrained")]
     result = CliRunner().invoke(app, arguments)

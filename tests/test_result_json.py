@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import pycocotools.mask
 import pytest
 from jsonschema import Draft202012Validator, ValidationError
 from typer.testing import CliRunner
@@ -17,14 +18,17 @@ from typer.testing import CliRunner
 from posekit.cli.app import app
 from posekit.errors import PromptError
 from posekit.io.load import load_pose
+from posekit.mesh.model import ObjectModel
 from posekit.nets.weights import build, save_networks
 from posekit.render import Renderer
-from posekit.results import SCHEMA_VERSION, estimates_from_json
+from posekit.results import SCHEMA_VERSION, Detection, Source, estimates_from_json
 from posekit.synth.example import Example, make_example, ply
+from posekit.view import View
 
 SCHEMA = json.loads(files("posekit").joinpath("schema/result.schema.json").read_text(encoding="utf-8"))
 DOCS = Path(__file__).parent.parent / "docs" / "result-json.md"
 CAMERA = "610,610,322,236"
+MASKED = (260.0, 140.0, 450.0, 290.0)
 
 
 @pytest.fixture(scope="module")
@@ -112,6 +116,45 @@ def test_track_writes_what_the_schema_says(folder: Path, tmp_path: Path) -> None
     for line in lines:
         check(line)
         assert line["schema"] == "posekit-frame"
+
+
+class Finder:
+    """Stands for a detector."""
+
+    def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
+        mask = np.zeros(view.image.shape[:2], np.bool_)
+        mask[140:290, 260:450] = True
+        return [
+            Detection((1.0, 2.0, 30.0, 40.0), None, 0.3, "toy"),
+            Detection(MASKED, mask, 0.9, "toy", Source.TRAINED),
+        ]
+
+
+def test_detect_writes_what_the_schema_says(folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("posekit.detect.novel.make_detector", lambda *_, **__: (Finder(), ["toy"]))
+    found = json.loads(run(folder, "detect", "photo.png", "--json", "-"))
+    check(found)
+    first, second = found["detections"]
+    assert (first["box"], first["score"], first["label"], first["source"]) == ([*MASKED], 0.9, "toy", "mask-rcnn")
+    assert pycocotools.mask.decode(first["mask"]).sum() == 150 * 190 and second["mask"] is None
+    assert not list(tmp_path.iterdir()), "no folder unless --out asks for one"
+    assert "toy: score 0.90" in run(folder, "detect", "photo.png", "--json", "detections.json", "--out", "out")
+    assert json.loads((tmp_path / "detections.json").read_text())["detections"] == found["detections"]
+    assert (tmp_path / "out" / "coco.json").exists()
+
+
+def test_track_on_standard_output(folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    flags = ("--pose", folder / "pose.json", "--runtime", "torch", "--frames", 2, "--json")
+    lines = [json.loads(line) for line in run(folder, "track", "frames", *flags, "-").splitlines()]
+    assert [line["frame"] for line in lines] == [0, 1] and not list(tmp_path.iterdir())
+    written = run(folder, "track", "frames", *flags, "poses.jsonl")
+    assert "wrote: poses.jsonl" in written and [path.name for path in tmp_path.iterdir()] == ["poses.jsonl"]
+    assert len((tmp_path / "poses.jsonl").read_text().splitlines()) == 2
+    arguments = ["track", "frames", "--model", "toy.ply", "--json", "-", "--rerun"]
+    refused = CliRunner().invoke(app, arguments)
+    assert refused.exit_code == 1 and "--rerun with --json" in refused.stderr and "--out" in refused.stderr
 
 
 def test_other_documents_are_refused(folder: Path) -> None:

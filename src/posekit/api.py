@@ -19,6 +19,7 @@ from posekit.estimate.estimator import EstimateOptions, PoseEstimator
 from posekit.estimate.instances import find_instances
 from posekit.geometry import Pose
 from posekit.io.calibration import Calibration, load_calibration
+from posekit.io.documents import camera_entry
 from posekit.io.files import write_bytes_atomic, write_text_atomic
 from posekit.io.load import ASSUMED_FOV, load_mask, load_view
 from posekit.lens import Lens
@@ -143,16 +144,11 @@ def result_json(
     view: View, estimates: Sequence[Estimate], weights_hash: str, about: dict[str, object] | None = None
 ) -> str:
     """The text of result.json. about: further entries, such as the files' names."""
-    camera, lens = view.camera, view.lens
-    seen_by: dict[str, object] = {"K": camera.K, "width": camera.width, "height": camera.height}
-    if lens is not None:  # boxes, masks and overlays are of the undistorted picture
-        taken = {"K": lens.camera.K, "width": lens.camera.width, "height": lens.camera.height}
-        seen_by["undistorted_from"] = {**taken, "model": lens.model, "distortion_coefficients": list(lens.coefficients)}
     return estimates_to_json(
         estimates,
         weights_hash=weights_hash,
         versions={name: version(name) for name in ("torch", "numpy", "opencv-python-headless", "moderngl")},
-        about={**(about or {}), "camera": seen_by},
+        about={**(about or {}), "camera": camera_entry(view)},
     )
 
 

@@ -16,6 +16,7 @@ from posekit.cli.options import (
     DetectorOption,
     ForceOption,
     ImageArgument,
+    JsonOption,
     OutOption,
     ThreadsOption,
     UnitsOption,
@@ -65,10 +66,11 @@ def detect(
     ] = None,
     out: OutOption = None,
     force: ForceOption = False,
+    json: JsonOption = None,
 ) -> None:
-    """Find objects in a photograph: boxes, masks and scores, as COCO and BOP JSON."""
-    from posekit.cli.output import OutputFolder
-    from posekit.detect.external import to_bop, to_coco
+    """Find objects in a photograph: boxes, masks and scores, as COCO, BOP or posekit JSON."""
+    from posekit.cli.output import Destination
+    from posekit.detect.external import to_bop, to_coco, to_document
     from posekit.detect.novel import NovelDetector, NovelOptions, make_detector
     from posekit.errors import ConfigError
     from posekit.estimate.instances import SearchOptions
@@ -79,7 +81,7 @@ def detect(
 
     if verify and not model:
         raise ConfigError("--verify looks for poses of meshes: pass --model MESH, or leave it out.")
-    folder = OutputFolder.chosen(out, Path("posekit-out") / f"{image.stem}-detections", force)
+    destination = Destination.chosen(out, Path("posekit-out") / f"{image.stem}-detections", force, json)
     use_threads(threads)
     view = load_view(image, camera)
     meshes = [ObjectModel.load(path, units=units) for path in model or ()]
@@ -94,22 +96,26 @@ def detect(
     if verify and isinstance(finder, NovelDetector):  # the poses are held to the minimum score, not the detections
         finder = NovelDetector(finder.detector, finder.renderer, NovelOptions(max_detections=max_detections))
     started = time.perf_counter()
-    found = sorted(finder.detect(view, meshes), key=lambda d: -d.score)
+    with destination.working("detecting"):
+        found = sorted(finder.detect(view, meshes), key=lambda d: -d.score)
     if verify:
         found = _verified(view, found, meshes, SearchOptions().min_score if min_score is None else min_score)
     seconds = time.perf_counter() - started
     for detection in found:
-        typer.echo(
+        destination.say(
             f"{detection.label or 'object'}: score {detection.score:.2f}, box "
             + ",".join(f"{v:.0f}" for v in detection.box)
         )
     if not found:
         names = ", ".join(m.name for m in meshes) or "an object"
-        typer.echo(f"{names} not found.")
-    typer.echo(f"{len(found)} detections in {seconds:.2f} s")
-    typer.echo(f"overlay: {folder.write('overlay.png', png(detections_overlay(view, found)))}")
-    typer.echo(f"COCO: {folder.write('coco.json', to_coco(found, classes, image, view.camera.size))}")
-    typer.echo(f"BOP: {folder.write('bop.json', to_bop(found, classes, image, seconds, scene))}")
+        destination.say(f"{names} not found.")
+    destination.say(f"{len(found)} detections in {seconds:.2f} s")
+    folder = destination.folder
+    if folder is not None:
+        destination.say(f"overlay: {folder.write('overlay.png', png(detections_overlay(view, found)))}")
+        destination.say(f"COCO: {folder.write('coco.json', to_coco(found, classes, image, view.camera.size))}")
+        destination.say(f"BOP: {folder.write('bop.json', to_bop(found, classes, image, seconds, scene))}")
+    destination.write_json(to_document(found, view, image, seconds))
 
 
 def _verified(

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict
+from functools import partial
+from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -17,6 +20,7 @@ from posekit.cli.options import (
     ColourEdgeOption,
     DeviceOption,
     IterationsOption,
+    JsonOption,
     MaskEdgeOption,
     PerturbOption,
     PresetOption,
@@ -28,6 +32,8 @@ from posekit.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from posekit.evaluate import Comparison
     from posekit.evaluate.run import Progress
 
@@ -116,15 +122,22 @@ def evaluate(
         tuple[Path, Path] | None,
         typer.Option("--compare", metavar="A B", help="Two result folders side by side.", rich_help_panel=OUTPUT),
     ] = None,
+    json: JsonOption = None,
 ) -> None:
     """Measure poses as the field does: tables, results.json, a BOP CSV and an HTML report.
 
     A killed run goes on where it was when the command is given again.
     """
+    from posekit.cli.output import check_json, write_json
+
+    check_json(json)
+    apart = json == "-"  # standard output is for JSON alone
     if comparison is not None:
         from posekit.evaluate import compare
 
-        _print_comparison(compare(*comparison, seed=seed))
+        found = compare(*comparison, seed=seed)
+        _print_comparison(found, apart)
+        write_json(json, dumps(asdict(found), indent=1) + "\n")
         return
     from posekit.estimate.estimator import EstimateOptions
     from posekit.evaluate import EvalOptions
@@ -159,9 +172,10 @@ def evaluate(
     folder = out or Path("posekit-out") / f"eval-{name}-{stage}"
     with _progress() as progress:
         outcome = run(options, folder, command=_command(), csv=csv, force=force, with_vsd=vsd, progress=progress)
-    _print_results(outcome.results)
+    _print_results(outcome.results, apart)
     for path in outcome.files:
-        typer.echo(f"{path}")
+        typer.echo(f"{path}", err=apart)
+    write_json(json, dumps(outcome.results, indent=1, allow_nan=False) + "\n")
 
 
 def _command() -> str:
@@ -228,10 +242,11 @@ _HEADS = {"2deg_2cm": "(2,2)", "5deg_5cm": "(5,5)", "10deg_10cm": "(10,10)", "5d
           "vsd_ar": "VSD", "mssd_ar": "MSSD", "mspd_ar": "MSPD", "ar": "AR", "ap": "AP"}  # fmt: skip
 
 
-def _print_results(results: Mapping[str, Any]) -> None:
-    from rich.console import Console
+def _print_results(results: Mapping[str, Any], apart: bool) -> None:
+    """apart: on standard error."""
     from rich.table import Table
 
+    say = partial(typer.echo, err=apart)
     data, counts, weights = results["dataset"], results["counts"], results["weights"]
     shown = [m for m in _SHOWN if m in results["mean"]]
     table = Table(title=f"{data['title']}: {results['stage']}, percent", title_justify="left")
@@ -246,31 +261,33 @@ def _print_results(results: Mapping[str, Any]) -> None:
     for name, values in (("mean over objects", results["mean"]), ("over all instances", results["pooled"])):
         cells = [f"{values[m]:.1f}" if m in values else "" for m in shown]
         table.add_row(name, "", str(counts["instances"]), str(counts["missing"]), *cells)
-    console = Console(width=None if Console().is_terminal else 160)
-    console.print(table)
-    _say(
-        f"instances: {data['instances']}; s: with symmetries; AR is BOP's over all instances, AP its mean over objects"
-    )
+    _show(table, apart)
+    say(f"instances: {data['instances']}; s: with symmetries; AR is BOP's over all instances, AP its mean over objects")
     if data["masks"].get("rendered"):
-        _say(f"visible masks: {data['masks']['rendered']} of {counts['instances']} rendered from the ground truth")
+        say(f"visible masks: {data['masks']['rendered']} of {counts['instances']} rendered from the ground truth")
     if data["split_list"]:
-        _say(f"split: {data['split_list']}, hash {data['split_hash']}")
+        say(f"split: {data['split_list']}, hash {data['split_hash']}")
     for kind, value in (results.get("detection_ap") or {}).items():
-        _say(f"{kind}: {'none' if value is None else f'{value:.1f}'}")
+        say(f"{kind}: {'none' if value is None else f'{value:.1f}'}")
     seconds = results["seconds_per_instance"]
     if seconds["median"] is not None:
-        _say(f"{seconds['median']:.2f} s per instance in the median, {seconds['mean']:.2f} in the mean; "
+        say(f"{seconds['median']:.2f} s per instance in the median, {seconds['mean']:.2f} in the mean; "
              f"weights {weights['hash']}; commit {results['commit']}; {results['machine']}")  # fmt: skip
     if data["name"] == "linemod":
-        _print_paper(results)
+        _print_paper(results, apart)
 
 
-def _say(text: str) -> None:
-    typer.echo(text)
-
-
-def _print_paper(results: Mapping[str, Any]) -> None:
+def _show(table: Table, apart: bool, width: int = 160) -> None:
+    """width: where the output is no terminal, characters."""
     from rich.console import Console
+
+    console = Console(stderr=apart)
+    if not console.is_terminal:
+        console = Console(stderr=apart, width=width)
+    console.print(table)
+
+
+def _print_paper(results: Mapping[str, Any], apart: bool) -> None:
     from rich.table import Table
 
     from posekit.evaluate.table import PAPER_MEASURES, paper_table
@@ -281,13 +298,13 @@ def _print_paper(results: Mapping[str, Any]) -> None:
         table.add_column(head, justify="right")
     for name, values in paper_table(results):
         table.add_row(name, *("-" if (v := values[m]) is None else f"{v:.1f}" for m in PAPER_MEASURES))
-    Console(width=None if Console().is_terminal else 160).print(table)
+    _show(table, apart)
 
 
-def _print_comparison(found: Comparison) -> None:
-    from rich.console import Console
+def _print_comparison(found: Comparison, apart: bool) -> None:
     from rich.table import Table
 
+    say = partial(typer.echo, err=apart)
     table = Table(title=f"{found.instances} instances in both, mean over objects, percent", title_justify="left")
     table.add_column("measure")
     for head in ("A", "B", "B - A", "95 % interval"):
@@ -296,9 +313,9 @@ def _print_comparison(found: Comparison) -> None:
         mark = " *" if d.clear else ""
         interval = f"{d.low:+.1f} to {d.high:+.1f}{mark}"
         table.add_row(d.measure, f"{d.a:.1f}", f"{d.b:.1f}", f"{d.difference:+.1f}", interval)
-    Console(width=None if Console().is_terminal else 120).print(table)
-    _say("interval: paired bootstrap over instances within each object; *: it leaves out zero")
+    _show(table, apart, 120)
+    say("interval: paired bootstrap over instances within each object; *: it leaves out zero")
     if found.only_a or found.only_b:
-        _say(f"left out: {found.only_a} instances only in A, {found.only_b} only in B")
+        say(f"left out: {found.only_a} instances only in A, {found.only_b} only in B")
     for note in found.notes:
-        _say(f"differs: {note}")
+        say(f"differs: {note}")

@@ -156,7 +156,8 @@ OutOption = Annotated[
     Path | None,
     typer.Option(
         metavar="DIR",
-        help="Folder for the results, new or empty. By default in posekit-out, or the next free posekit-out-2, -3.",
+        help="Folder for the results, new or empty. By default one in posekit-out, or in the next free posekit-out-2, "
+        "-3; with --json none.",
         rich_help_panel=OUTPUT,
     ),
 ]
@@ -167,7 +168,7 @@ JsonOption = Annotated[
     str | None,
     typer.Option(
         metavar="FILE|-",
-        help="Write the result there, - for standard output; then a folder is written only with --out.",
+        help="Write the result as JSON to FILE, or with - to standard output, where then nothing else is written.",
         rich_help_panel=OUTPUT,
     ),
 ]

@@ -83,6 +83,26 @@ def _occupied(folder: Path) -> bool:
         raise OutputError(f"the output folder {folder} cannot be read: {error.strerror}.") from error
 
 
+def check_json(json: str | None) -> None:
+    """Whether ``--json`` can be written. Raises OutputError."""
+    if json is None or json == "-":
+        return
+    if Path(json).is_dir():
+        raise OutputError(f"--json {json} is a folder: give a file, or - for standard output.")
+    if not Path(json).parent.is_dir():
+        raise OutputError(f"--json {json}: there is no folder {Path(json).parent}. Make it first.")
+    check_writable(Path(json).parent, f"--json {json} cannot be written")
+
+
+def write_json(json: str | None, text: str) -> None:
+    """A document where ``--json`` asks for it: nowhere, on standard output (-) or in a file."""
+    if json == "-":
+        typer.echo(text, nl=False)
+    elif json is not None:
+        write_text_atomic(Path(json), text)
+        typer.echo(f"JSON: {json}")
+
+
 @dataclass(frozen=True)
 class Destination:
     """What ``--out``, ``--force`` and ``--json`` ask for, checked before any work is done.
@@ -99,12 +119,7 @@ class Destination:
     def chosen(
         cls, out: Path | None, default: Path, force: bool, json: str | None, formats: Sequence[str] = ()
     ) -> Destination:
-        if json is not None and json != "-":
-            if Path(json).is_dir():
-                raise OutputError(f"--json {json} is a folder: give a file, or - for standard output.")
-            if not Path(json).parent.is_dir():
-                raise OutputError(f"--json {json}: there is no folder {Path(json).parent}. Make it first.")
-            check_writable(Path(json).parent, f"--json {json} cannot be written")
+        check_json(json)
         check_formats(formats)
         if out is None and json is not None:
             if set(formats) - {"json"}:
@@ -162,11 +177,11 @@ class Destination:
             for format_ in dict.fromkeys(self.formats):
                 for name, text in pose_files(format_, [named_pose(each) for each in found]).items():
                     self.say(f"{format_}: {self.folder.write(name, text)}")
-        if self.json == "-":
-            typer.echo(result, nl=False)
-        elif self.json is not None:
-            write_text_atomic(Path(self.json), result)
-            self.say(f"result: {self.json}")
+        self.write_json(result)
+
+    def write_json(self, text: str) -> None:
+        """Where ``--json`` asks for it."""
+        write_json(self.json, text)
 
 
 def _overlay(view: View, results: Sequence[tuple[PoseEstimator, Sequence[Estimate]]], blend: float) -> bytes:

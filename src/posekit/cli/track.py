@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import IO, TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -22,6 +22,7 @@ from posekit.cli.options import (
     DeviceOption,
     ForceOption,
     FormatOption,
+    JsonOption,
     ModelsOption,
     OutOption,
     PresetOption,
@@ -34,6 +35,7 @@ from posekit.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from posekit.cli.output import Destination
     from posekit.io.pose_formats import NamedPose
     from posekit.io.video import Frame, Frames, VideoWriter
     from posekit.tracking.tracker import Tracked, Tracker
@@ -83,18 +85,20 @@ def track(
     frames: Annotated[int | None, typer.Option(min=1, help="Frames at most.", rich_help_panel=OUTPUT)] = None,
     out: OutOption = None,
     force: ForceOption = False,
+    json: JsonOption = None,
     format_: FormatOption = None,
     require_reliable: RequireReliableOption = False,
 ) -> None:
     """Follow objects through a video: poses as they come, and an overlay to look at."""
-    from posekit.cli.output import OutputFolder
-    from posekit.io.pose_formats import check_formats, pose_files
+    from posekit.cli.output import Destination
+    from posekit.errors import ImageError, OutputError, PromptError
+    from posekit.io.pose_formats import pose_files
 
-    check_formats(format_ or ())
+    default = Path("posekit-out") / f"{Path(source).stem or 'camera'}-track"
+    destination = Destination.chosen(out, default, force, json, format_ or ())
+    if rerun and destination.folder is None:
+        raise OutputError("--rerun with --json writes into a folder: pass --out DIR too.")
 
-    folder = OutputFolder.chosen(out, Path("posekit-out") / f"{Path(source).stem or 'camera'}-track", force)
-
-    from posekit.errors import ImageError, PromptError
     from posekit.estimate.estimator import Estimators
     from posekit.io.load import load_pose
     from posekit.io.video import ReadAhead, open_frames
@@ -118,16 +122,17 @@ def track(
         Tracker(mesh, pose=start, detector=finder, config=config, estimator=estimators(mesh))
         for mesh, start in zip(meshes, starts, strict=True)
     ]
-    counts = _run(trackers, sequence, folder, overlay, rerun, frames, keep=bool(format_))
-    for kind in dict.fromkeys(format_ or ()):
-        for name, text in pose_files(kind, counts.poses).items():
-            counts.files.append(folder.write(name, text).name)
-    typer.echo(f"reliable: {counts.reliable} of {counts.used * len(trackers)} poses")
-    typer.echo(", ".join(f"{count} {state}" for state, count in counts.states.items()))
+    counts = _run(trackers, sequence, destination, overlay, rerun, frames, keep=bool(format_))
+    if destination.folder is not None:
+        for kind in dict.fromkeys(format_ or ()):
+            for name, text in pose_files(kind, counts.poses).items():
+                counts.files.append(destination.folder.write(name, text))
+    destination.say(f"reliable: {counts.reliable} of {counts.used * len(trackers)} poses")
+    destination.say(", ".join(f"{count} {state}" for state, count in counts.states.items()))
     if counts.problems:
         typer.echo(f"{len(counts.problems)} frames could not be used; the first: {counts.problems[0]}", err=True)
-    for name in counts.files:
-        typer.echo(f"wrote: {folder.path / name}")
+    for path in counts.files:
+        destination.say(f"wrote: {path}")
     if not counts.used:
         raise ImageError(
             f"not one frame of {source} could be used: {counts.problems[0] if counts.problems else 'it is empty'}."
@@ -148,13 +153,13 @@ class _Counts:
         self.states: dict[str, int] = {}
         self.problems: list[str] = []
         self.poses: list[NamedPose] = []
-        self.files: list[str] = ["poses.jsonl", "poses.csv"]
+        self.files: list[Path] = []
 
 
 def _run(
     trackers: Sequence[Tracker],
     sequence: Frames,
-    folder: Any,
+    destination: Destination,
     overlay: bool,
     rerun: bool,
     most: int | None,
@@ -164,23 +169,18 @@ def _run(
     """Track every frame, and write each as soon as it is done: a killed run keeps its frames. keep: all poses, for
     formats that are written at the end."""
     from posekit.cli.output import named_pose
-    from posekit.errors import OutputError
-    from posekit.io.video import VideoWriter
 
-    counts = _Counts()
-    try:
-        folder.path.mkdir(parents=True, exist_ok=True)
-        lines, table = ((folder.path / name).open("w", encoding="utf-8", buffering=1) for name in counts.files)
-    except OSError as error:
-        raise OutputError(f"the folder {folder.path} cannot be written: {error.strerror}.") from error
-    with (
-        lines,
-        table,
-        VideoWriter(folder.path / "overlay.mp4", sequence.rate) as writer,
-        _recorder(folder.path / "track.rrd", trackers, rerun) as record,
-        _bar(sequence) as show,
-    ):
-        table.write(COLUMNS + "\n")
+    counts, folder = _Counts(), None if destination.folder is None else destination.folder.path
+    with ExitStack() as stack:
+        lines = _Lines(destination, stack, counts)
+        writer = record = None
+        if folder is not None and overlay:
+            from posekit.io.video import VideoWriter
+
+            writer = stack.enter_context(VideoWriter(folder / "overlay.mp4", sequence.rate))
+        if folder is not None and rerun:
+            record = stack.enter_context(_recorder(folder / "track.rrd", trackers))
+        show = stack.enter_context(_bar(sequence))
         for done, frame in enumerate(sequence):
             if most is not None and done >= most:
                 break
@@ -188,20 +188,53 @@ def _run(
             results = _step(trackers, frame, counts)
             seconds = time.perf_counter() - started
             for k, (tracker, result) in enumerate(zip(trackers, results, strict=True)):
-                lines.write(_line(frame, tracker.model.name, result))
-                if result.estimate is not None:
-                    if keep:
-                        counts.poses.append(named_pose(result.estimate, frame.number, frame.seconds))
-                    table.write(_row(frame, _number(tracker.model.name, k), result, seconds) + "\n")
-            record(frame, results)
-            if overlay and frame.image is not None:
+                lines.write(frame, tracker.model.name, k, result, seconds)
+                if keep and result.estimate is not None:
+                    counts.poses.append(named_pose(result.estimate, frame.number, frame.seconds))
+            if record is not None:
+                record(frame, results)
+            if writer is not None and frame.image is not None:
                 _draw(writer, frame, trackers, results)
             show(seconds, results)
-    if overlay and counts.used:
-        counts.files.append("overlay.mp4")
-    if rerun:
-        counts.files.append("track.rrd")
+    if folder is not None:
+        counts.files += [folder / "overlay.mp4"] if overlay and counts.used else []
+        counts.files += [folder / "track.rrd"] if rerun else []
     return counts
+
+
+class _Lines:
+    """Where each frame's poses go as soon as they are known: poses.jsonl and poses.csv in the folder, and what
+    ``--json`` names. Raises OutputError where they cannot be written."""
+
+    def __init__(self, destination: Destination, stack: ExitStack, counts: _Counts) -> None:
+        from posekit.errors import OutputError
+
+        self.table: IO[str] | None = None
+        self.files: list[IO[str]] = []
+        paths = [] if destination.json in (None, "-") else [Path(str(destination.json))]
+        self.aloud = destination.json == "-"
+        try:
+            if destination.folder is not None:
+                folder = destination.folder.path
+                folder.mkdir(parents=True, exist_ok=True)
+                paths.append(folder / "poses.jsonl")
+                counts.files.append(folder / "poses.csv")
+                self.table = stack.enter_context(counts.files[-1].open("w", encoding="utf-8", buffering=1))
+                self.table.write(COLUMNS + "\n")
+            self.files = [stack.enter_context(path.open("w", encoding="utf-8", buffering=1)) for path in paths]
+        except OSError as error:
+            raise OutputError(f"{error.filename} cannot be written: {error.strerror}.") from error
+        counts.files = [*reversed(paths), *counts.files]
+
+    def write(self, frame: Frame, name: str, k: int, result: Tracked, seconds: float) -> None:
+        """The k-th mesh in a frame."""
+        line = _line(frame, name, result)
+        for file in self.files:
+            file.write(line)
+        if self.aloud:
+            typer.echo(line, nl=False)
+        if self.table is not None and result.estimate is not None:
+            self.table.write(_row(frame, _number(name, k), result, seconds) + "\n")
 
 
 def _step(trackers: Sequence[Tracker], frame: Frame, counts: _Counts) -> list[Tracked]:
@@ -276,11 +309,8 @@ def _draw(writer: VideoWriter, frame: Frame, trackers: Sequence[Tracker], result
 
 
 @contextmanager
-def _recorder(path: Path, trackers: Sequence[Tracker], wanted: bool) -> Iterator[Any]:
+def _recorder(path: Path, trackers: Sequence[Tracker]) -> Iterator[Any]:
     """What is called with each frame and its results."""
-    if not wanted:
-        yield lambda *_: None
-        return
     from posekit.visualise.recording import Recorder
 
     with Recorder(path, [tracker.model for tracker in trackers]) as recorder:

@@ -15,8 +15,9 @@ from posekit.camera import Box, mask_box
 from posekit.detect.prompts import clip_box
 from posekit.detect.segmentation import decode, encode, xywh
 from posekit.errors import PromptError
+from posekit.io.documents import camera_entry
 from posekit.mesh.model import ObjectModel
-from posekit.results import Detection, Source
+from posekit.results import DETECTIONS_SCHEMA, Detection, Source, document_to_json
 from posekit.view import View
 
 log = logging.getLogger("posekit")
@@ -257,6 +258,22 @@ def to_bop(
     number = _image_number(image, {}) or 0
     entries = [{"scene_id": scene, **_entry(d, number, numbers), "time": seconds} for d in detections]
     return json.dumps(entries, indent=1, allow_nan=False) + "\n"
+
+
+def to_document(detections: Sequence[Detection], view: View, image: Path, seconds: float) -> str:
+    """posekit's own form (docs/result-json.md), best first. seconds: of the whole picture."""
+    entries = [
+        {
+            "box": list(d.box),
+            "score": d.score,
+            "label": d.label,
+            "source": d.source.value,
+            "mask": None if d.mask is None else encode(d.mask),
+        }
+        for d in sorted(detections, key=lambda d: -d.score)
+    ]
+    about = {"image": image, "camera": camera_entry(view), "seconds": seconds, "detections": entries}
+    return document_to_json(DETECTIONS_SCHEMA, about)
 
 
 def _entry(detection: Detection, image: int, numbers: Mapping[str, int]) -> dict[str, Any]:
