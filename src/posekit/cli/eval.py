@@ -76,13 +76,14 @@ def evaluate(
         typer.Option(
             metavar="gt-boxes|gt-masks|detector|FILE.json", help="What estimate starts from.", rich_help_panel=STAGE
         ),
-    ] = "gt-masks",
+    ] = "gt-boxes",
     detector: Annotated[
         str, typer.Option(metavar="novel|FILE", help="With --detections detector: which.", rich_help_panel=STAGE)
     ] = "novel",
     masks: Annotated[
-        Literal["true", "none"], typer.Option(help="What refine knows of the silhouette.", rich_help_panel=STAGE)
-    ] = "true",
+        Literal["true", "none"],
+        typer.Option(help="Whether refine is given the true mask (drawn from the annotation).", rich_help_panel=STAGE),
+    ] = "none",
     noise: Annotated[
         str,
         typer.Option(metavar="DEG,X,Y,Z", help="Refine: standard deviations, degrees and cm.", rich_help_panel=STAGE),
@@ -246,10 +247,12 @@ def _print_results(results: Mapping[str, Any], apart: bool) -> None:
     """apart: on standard error."""
     from rich.table import Table
 
+    from posekit.evaluate.table import TRUE_MASKS
+
     say = partial(typer.echo, err=apart)
     data, counts, weights = results["dataset"], results["counts"], results["weights"]
     shown = [m for m in _SHOWN if m in results["mean"]]
-    table = Table(title=f"{data['title']}: {results['stage']}, percent", title_justify="left")
+    table = Table(title=f"{results['title']}, percent", title_justify="left")
     table.add_column("object")
     for head in ("training", "n", "missing", *(_HEADS[m] for m in shown)):
         table.add_column(head, justify="right")
@@ -263,6 +266,8 @@ def _print_results(results: Mapping[str, Any], apart: bool) -> None:
         table.add_row(name, "", str(counts["instances"]), str(counts["missing"]), *cells)
     _show(table, apart)
     say(f"instances: {data['instances']}; s: with symmetries; AR is BOP's over all instances, AP its mean over objects")
+    if results["true_masks"]:
+        say(TRUE_MASKS)
     if data["masks"].get("rendered"):
         say(f"visible masks: {data['masks']['rendered']} of {counts['instances']} rendered from the ground truth")
     if data["split_list"]:
