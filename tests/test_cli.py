@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import trimesh
 from typer.main import get_command
 from typer.testing import CliRunner, Result
 
@@ -266,6 +267,27 @@ def test_what_the_mesh_and_the_picture_do_not_allow_is_said_once(example: Exampl
     assert "has no colours" in colours
     [size] = limits(example.model, [near, far, far])
     assert "only 39 pixels large 2 of 3 times" in size
+
+
+def test_a_symmetry_that_nobody_told_is_noted(invoke: Invoke, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    square = trimesh.creation.box((0.06, 0.06, 0.1))
+    square.export(tmp_path / "post.ply")
+    options = {"model": tmp_path / "post.ply", "units": "m", "json": "-"}
+    told = invoke("refine", **options)
+    assert "post looks the same after half a turn about its x axis, half a turn" in " ".join(told.stderr.split()), (
+        told.stderr
+    )
+    assert told.stderr.count("pass --symmetry x:2,y:2,z:4 to") == 1
+    [kept] = (tmp_path / "cache" / "posekit" / "symmetries").iterdir()
+    assert kept.read_text() == "x:2,y:2,z:4\n"
+    for stated in ("none", "z:4", "detect"):
+        again = invoke("refine", symmetry=stated, **options)
+        assert again.exit_code == 0 and "pass --symmetry" not in again.stderr
+        assert (json.loads(again.stdout)["estimates"][0]["branch"] is None) == (stated == "none")
+    assert "note: post.ply: looks the same after half a turn about its x axis" in again.stderr
+    (tmp_path / "models_info.json").write_text(json.dumps({"post": {}}))
+    assert "looks the same" not in invoke("refine", **options).stderr, "the data set knows"
 
 
 def test_a_mesh_without_colours_is_told_of(invoke: Invoke, example: Example, tmp_path: Path) -> None:

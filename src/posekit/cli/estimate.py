@@ -104,18 +104,18 @@ def estimate(
 
     destination = Destination.chosen(out, Path("posekit-out") / image.stem, force, json, format_ or ())
 
+    from posekit.cli.meshes import load_meshes
     from posekit.cli.prompts import prompt_for
     from posekit.estimate.estimator import EstimateOptions, Estimators
     from posekit.estimate.instances import SearchOptions, find_instances
     from posekit.io.load import load_view
-    from posekit.mesh.model import ObjectModel
 
     use_threads(threads)
     options = EstimateOptions(
         init, hypotheses, update, stop, iterations, stop_angle, mask_edge=mask_edge, colour_edge=colour_edge, top=top
     )
     view = load_view(image, camera)
-    meshes = [ObjectModel.load(path, units=units, symmetry=symmetry) for path in model]
+    meshes = load_meshes(model, units, symmetry)
     finder = prompt_for(box, mask, mask_from, detections, image, view.lens)
     asked = finder is not None
     if finder is None:
@@ -134,6 +134,8 @@ def estimate(
     with destination.working("estimating"):
         results = find_instances(estimators, view, meshes, found, search)
     paths = [{"image": image, "mesh": path} for path in model]
-    destination.deliver_all(view, [(estimators(each.model), each.instances) for each in results], paths, blend)
+    destination.deliver_all(
+        view, [(estimators(each.model), each.instances) for each in results], paths, blend, symmetry
+    )
     if require_reliable:
         end_unless_reliable([each for found_of in results for each in found_of.instances])

@@ -29,8 +29,10 @@ UnitsOption = Annotated[
 SymmetryOption = Annotated[
     str | None,
     typer.Option(
-        metavar="TEXT|FILE",
-        help="The mesh's symmetries, where no models_info.json lies beside it.",
+        metavar="z:2|z:inf|...|detect|none|FILE",
+        help="The turns after which the object looks the same: z:2 is half a turn about the mesh's z axis, z:inf any "
+        "turn; several with commas. detect looks for them; FILE is a models_info.json as BOP has it, which is also "
+        "read where it lies beside the mesh.",
         rich_help_panel=INPUT,
     ),
 ]

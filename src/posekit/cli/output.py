@@ -144,9 +144,10 @@ class Destination:
         estimates: Sequence[Estimate],
         files: Mapping[str, Path],
         blend: float = 0.0,
+        symmetry: str | None = "none",
     ) -> None:
         """`deliver_all` of one mesh. files: what they were made from, by name, for the result."""
-        self.deliver_all(view, [(estimator, estimates)], [files], blend)
+        self.deliver_all(view, [(estimator, estimates)], [files], blend, symmetry)
 
     def deliver_all(
         self,
@@ -154,17 +155,19 @@ class Destination:
         results: Sequence[tuple[PoseEstimator, Sequence[Estimate]]],
         files: Sequence[Mapping[str, Path]],
         blend: float = 0.0,
+        symmetry: str | None = "none",
     ) -> None:
         """Print the estimates and write them: one result as JSON, and one overlay. files: by mesh. blend: how much of
-        the rendered meshes the overlay shows."""
+        the rendered meshes the overlay shows. symmetry: what was said of the meshes, None where nothing was."""
         from posekit.api import result_json
 
-        for estimator, estimates in results:
+        for (estimator, estimates), made_from in zip(results, files, strict=True):
             for estimate in estimates:
                 self.say(describe(estimate))
             if not estimates:
                 self.say(f"{estimator.model.name} not found: no pose.")
-            for note in limits(estimator.model, estimates):
+            seen = _unstated_symmetry(estimator, made_from["mesh"]) if estimates and symmetry is None else "none"
+            for note in limits(estimator.model, estimates, seen):
                 log.info(note)
         about: dict[str, object] = dict(files[0])
         if len(files) > 1:
@@ -220,9 +223,25 @@ def named_pose(estimate: Estimate, frame: int = 0, seconds: float | None = None)
     )
 
 
-def limits(model: ObjectModel, estimates: Sequence[Estimate]) -> list[str]:
-    """What the mesh and the picture do not allow, each once, with what helps."""
+def _unstated_symmetry(estimator: PoseEstimator, mesh: Path) -> str:
+    """The symmetry that a mesh has by the looks of it and nobody told; "none" without one."""
+    from posekit.datasets.symmetry import declared, detected_symmetry
+
+    model = estimator.model
+    return "none" if model.symmetries or declared(mesh) else detected_symmetry(estimator.renderer, model)
+
+
+def limits(model: ObjectModel, estimates: Sequence[Estimate], symmetry: str = "none") -> list[str]:
+    """What the mesh and the picture do not allow, each once, with what helps. symmetry: that nobody told, as
+    ``--symmetry`` takes it."""
     notes = []
+    if estimates and symmetry != "none":
+        from posekit.datasets.symmetry import in_words
+
+        notes.append(
+            f"{model.name} looks the same after {in_words(symmetry)}, so that several poses fit equally well and any "
+            f"of them may be given: pass --symmetry {symmetry} to have it considered, or --symmetry none."
+        )
     if estimates and model.colors is None and model.texture is None:
         notes.append(
             f"{model.name} has no colours: only its shape is compared, and a turn that leaves the silhouette as it is "

@@ -80,10 +80,10 @@ def refine(
 
     destination = Destination.chosen(out, Path("posekit-out") / f"{image.stem}-refined", force, json, format_ or ())
 
+    from posekit.cli.meshes import load_meshes
     from posekit.cli.prompts import detector_for
     from posekit.estimate.estimator import EstimateOptions, PoseEstimator
     from posekit.io.load import load_pose, load_view
-    from posekit.mesh.model import ObjectModel
 
     use_threads(threads)
     options = EstimateOptions(
@@ -97,7 +97,7 @@ def refine(
     )
     start = load_pose(pose)
     view = load_view(image, camera)
-    mesh = ObjectModel.load(model, units=units, symmetry=symmetry)
+    [mesh] = load_meshes([model], units, symmetry)
     if box is not None or mask is not None:
         [detection] = detector_for(box, mask, mask_from, view.lens).detect(view, [mesh])
         view = view.with_mask(detection.mask)
@@ -105,6 +105,6 @@ def refine(
         estimator = PoseEstimator(mesh, preset=preset, weights=weights, options=options, device=device)
     with destination.working("refining"):
         refined = estimator.refine(view, start)
-    destination.deliver(estimator, view, [refined], {"image": image, "mesh": model}, blend)
+    destination.deliver(estimator, view, [refined], {"image": image, "mesh": model}, blend, symmetry)
     if require_reliable:
         end_unless_reliable([refined])

@@ -90,6 +90,7 @@ def track(
     require_reliable: RequireReliableOption = False,
 ) -> None:
     """Follow objects through a video: poses as they come, and an overlay to look at."""
+    from posekit.cli.meshes import load_meshes
     from posekit.cli.output import Destination
     from posekit.errors import ImageError, OutputError, PromptError
     from posekit.io.pose_formats import pose_files
@@ -102,7 +103,6 @@ def track(
     from posekit.estimate.estimator import Estimators
     from posekit.io.load import load_pose
     from posekit.io.video import ReadAhead, open_frames
-    from posekit.mesh.model import ObjectModel
     from posekit.tracking.tracker import TrackConfig, Tracker
 
     if pose and len(pose) != len(model):
@@ -110,7 +110,7 @@ def track(
     use_threads(threads)
     config = TrackConfig(restart_angle, still_angle, iterations=iterations, runtime=runtime)
     starts = [load_pose(path) for path in pose] if pose else [None] * len(model)
-    meshes = [ObjectModel.load(path, units=units, symmetry=symmetry) for path in model]
+    meshes = load_meshes(model, units, symmetry)
     sequence = ReadAhead(open_frames(source, camera), latest=live)
     finder = None
     if not pose or detector is not None:
