@@ -340,6 +340,19 @@ def test_formats_for_other_programs(invoke: Invoke, folder: Path, tmp_path: Path
     assert_fails(invoke("refine", None, "--format", "xml"), "--format xml", "blender")
 
 
+def test_a_recording_for_rerun(invoke: Invoke, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = invoke("estimate", None, "--rerun", top=2, out="out")
+    assert found.exit_code == 0 and "recording: out/estimate.rrd" in found.stdout, found.output
+    recorded = (tmp_path / "out" / "estimate.rrd").read_bytes()
+    assert recorded[:3] == b"RRF"
+    for entity in (b"objects/0-toy", b"camera/image", b"alternatives/0-toy/2", b"refinement/0-toy", b"iteration"):
+        assert entity in recorded
+    assert not list((tmp_path / "out").glob(".*"))
+    assert_fails(invoke("refine", None, "--rerun", json="-"), "--rerun with --json", "--out")
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert_fails(invoke("refine", "missing.png", "--rerun"), "posekit[rerun]")
+
+
 def test_an_estimate_can_be_made_twice(invoke: Invoke, tmp_path: Path) -> None:
     assert [invoke("estimate").exit_code for _ in range(2)] == [0, 0]
     first, second = (tmp_path / name / "photo" / "result.json" for name in ("posekit-out", "posekit-out-2"))

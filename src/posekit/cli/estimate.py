@@ -29,6 +29,7 @@ from posekit.cli.options import (
     OutOption,
     PresetOption,
     RequireReliableOption,
+    RerunOption,
     StopAngleOption,
     StopOption,
     SymmetryOption,
@@ -97,12 +98,14 @@ def estimate(
     json: JsonOption = None,
     blend: BlendOption = 0.0,
     format_: FormatOption = None,
+    rerun: RerunOption = False,
     require_reliable: RequireReliableOption = False,
 ) -> None:
     """Estimate objects' poses in a photograph, from their meshes. A box, a mask or detections help, but need not be."""
     from posekit.cli.output import Destination, end_unless_reliable
 
-    destination = Destination.chosen(out, Path("posekit-out") / image.stem, force, json, format_ or ())
+    recording = "estimate.rrd" if rerun else None
+    destination = Destination.chosen(out, Path("posekit-out") / image.stem, force, json, format_ or (), recording)
 
     from posekit.cli.meshes import load_meshes
     from posekit.cli.prompts import prompt_for

@@ -154,6 +154,14 @@ RequireReliableOption = Annotated[
         rich_help_panel=OUTPUT,
     ),
 ]
+RerunOption = Annotated[
+    bool,
+    typer.Option(
+        "--rerun",
+        help="Also write a recording (.rrd) for the Rerun viewer: photograph, camera and meshes at their poses in 3D.",
+        rich_help_panel=OUTPUT,
+    ),
+]
 OutOption = Annotated[
     Path | None,
     typer.Option(

@@ -108,24 +108,37 @@ class Destination:
     """What ``--out``, ``--force`` and ``--json`` ask for, checked before any work is done.
 
     json: None, "-" or a file. With ``--json`` and no ``--out`` no folder is written. formats: of further files with
-    the poses.
+    the poses. recording: the name of a recording for Rerun, None for none.
     """
 
     folder: OutputFolder | None
     json: str | None
     formats: tuple[str, ...] = ()
+    recording: str | None = None
 
     @classmethod
     def chosen(
-        cls, out: Path | None, default: Path, force: bool, json: str | None, formats: Sequence[str] = ()
+        cls,
+        out: Path | None,
+        default: Path,
+        force: bool,
+        json: str | None,
+        formats: Sequence[str] = (),
+        recording: str | None = None,
     ) -> Destination:
         check_json(json)
         check_formats(formats)
         if out is None and json is not None:
             if set(formats) - {"json"}:
                 raise OutputError(f"--format {formats[0]} with --json writes into a folder: pass --out DIR too.")
+            if recording is not None:
+                raise OutputError("--rerun with --json writes into a folder: pass --out DIR too.")
             return cls(None, json)
-        return cls(OutputFolder.chosen(out, default, force), json, tuple(formats))
+        if recording is not None:
+            from posekit.visualise.recording import load_rerun
+
+            load_rerun()
+        return cls(OutputFolder.chosen(out, default, force), json, tuple(formats), recording)
 
     def say(self, text: str) -> None:
         """Tell the person something; on standard error where standard output is for JSON."""
@@ -180,6 +193,12 @@ class Destination:
             for format_ in dict.fromkeys(self.formats):
                 for name, text in pose_files(format_, [named_pose(each) for each in found]).items():
                     self.say(f"{format_}: {self.folder.write(name, text)}")
+            if self.recording is not None:
+                from posekit.visualise.recording import record_estimates
+
+                shown = [(estimator.model, each) for estimator, estimates in results for each in estimates]
+                record_estimates(self.folder.path / self.recording, view, shown)
+                self.say(f"recording: {self.folder.path / self.recording}")
         self.write_json(result)
 
     def write_json(self, text: str) -> None:

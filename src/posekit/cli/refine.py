@@ -27,6 +27,7 @@ from posekit.cli.options import (
     PerturbOption,
     PresetOption,
     RequireReliableOption,
+    RerunOption,
     StopAngleOption,
     StopOption,
     SymmetryOption,
@@ -73,12 +74,14 @@ def refine(
     json: JsonOption = None,
     blend: BlendOption = 0.0,
     format_: FormatOption = None,
+    rerun: RerunOption = False,
     require_reliable: RequireReliableOption = False,
 ) -> None:
     """Refine a pose that is roughly known; a mask or a box helps, but neither is needed."""
     from posekit.cli.output import Destination, end_unless_reliable
 
-    destination = Destination.chosen(out, Path("posekit-out") / f"{image.stem}-refined", force, json, format_ or ())
+    default, recording = Path("posekit-out") / f"{image.stem}-refined", "refine.rrd" if rerun else None
+    destination = Destination.chosen(out, default, force, json, format_ or (), recording)
 
     from posekit.cli.meshes import load_meshes
     from posekit.cli.prompts import detector_for

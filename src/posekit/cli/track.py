@@ -27,6 +27,7 @@ from posekit.cli.options import (
     OutOption,
     PresetOption,
     RequireReliableOption,
+    RerunOption,
     SymmetryOption,
     ThreadsOption,
     UnitsOption,
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from posekit.io.video import Frame, Frames, VideoWriter
     from posekit.tracking.tracker import Tracked, Tracker
 
+RECORDING = "track.rrd"
 COLUMNS = "scene_id,im_id,obj_id,score,R,t,time"
 
 
@@ -76,9 +78,7 @@ def track(
     threads: ThreadsOption = None,
     device: DeviceOption = "auto",
     overlay: Annotated[bool, typer.Option(help="Write overlay.mp4.", rich_help_panel=OUTPUT)] = True,
-    rerun: Annotated[
-        bool, typer.Option("--rerun", help="Write track.rrd for the Rerun viewer.", rich_help_panel=OUTPUT)
-    ] = False,
+    rerun: RerunOption = False,
     live: Annotated[
         bool, typer.Option("--live", help="Drop frames to keep up with a camera.", rich_help_panel=OUTPUT)
     ] = False,
@@ -92,13 +92,11 @@ def track(
     """Follow objects through a video: poses as they come, and an overlay to look at."""
     from posekit.cli.meshes import load_meshes
     from posekit.cli.output import Destination
-    from posekit.errors import ImageError, OutputError, PromptError
+    from posekit.errors import ImageError, PromptError
     from posekit.io.pose_formats import pose_files
 
     default = Path("posekit-out") / f"{Path(source).stem or 'camera'}-track"
-    destination = Destination.chosen(out, default, force, json, format_ or ())
-    if rerun and destination.folder is None:
-        raise OutputError("--rerun with --json writes into a folder: pass --out DIR too.")
+    destination = Destination.chosen(out, default, force, json, format_ or (), RECORDING if rerun else None)
 
     from posekit.estimate.estimator import Estimators
     from posekit.io.load import load_pose
@@ -122,7 +120,7 @@ def track(
         Tracker(mesh, pose=start, detector=finder, config=config, estimator=estimators(mesh))
         for mesh, start in zip(meshes, starts, strict=True)
     ]
-    counts = _run(trackers, sequence, destination, overlay, rerun, frames, keep=bool(format_))
+    counts = _run(trackers, sequence, destination, overlay, frames, keep=bool(format_))
     if destination.folder is not None:
         for kind in dict.fromkeys(format_ or ()):
             for name, text in pose_files(kind, counts.poses).items():
@@ -161,7 +159,6 @@ def _run(
     sequence: Frames,
     destination: Destination,
     overlay: bool,
-    rerun: bool,
     most: int | None,
     *,
     keep: bool,
@@ -178,8 +175,8 @@ def _run(
             from posekit.io.video import VideoWriter
 
             writer = stack.enter_context(VideoWriter(folder / "overlay.mp4", sequence.rate))
-        if folder is not None and rerun:
-            record = stack.enter_context(_recorder(folder / "track.rrd", trackers))
+        if folder is not None and destination.recording is not None:
+            record = stack.enter_context(_recorder(folder / destination.recording, trackers))
         show = stack.enter_context(_bar(sequence))
         for done, frame in enumerate(sequence):
             if most is not None and done >= most:
@@ -198,7 +195,7 @@ def _run(
             show(seconds, results)
     if folder is not None:
         counts.files += [folder / "overlay.mp4"] if overlay and counts.used else []
-        counts.files += [folder / "track.rrd"] if rerun else []
+        counts.files += [] if destination.recording is None else [folder / destination.recording]
     return counts
 
 
