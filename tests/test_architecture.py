@@ -48,6 +48,7 @@ DOORS = {
     "av": {"io"},
     "rerun": {"visualise"},
     "openvino": {"nets", "cli"},
+    "supervision": {"detect"},
 }
 
 ROOM_LAYER = {room: layer for layer, rooms in LAYERS.items() for room in rooms}
