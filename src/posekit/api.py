@@ -125,9 +125,10 @@ def estimate(
     image: a file, uint8 RGB (H, W, 3), or a View, whose own camera counts.
     model: a mesh's file (with ``units`` and ``symmetry``), an ObjectModel, or a PoseEstimator, which spares loading the
     networks again for the next picture (and has its own weights and options).
-    box: edges (x0, y0, x1, y1), pixels. mask: a file or bool (H, W). detections: of another program, a list of Detection
-    or ``supervision.Detections``: those whose label is the mesh's name (case does not count), or all where they have no
-    label, or one label only. All three are of the photograph as it was taken; without any the object is looked for.
+    box: edges (x0, y0, x1, y1), pixels. mask: a file or bool (H, W).
+    detections: of another program, a list of Detection or ``supervision.Detections``: those whose label is the mesh's
+    name (case does not count), or all where they have no label, or one label only.
+    Box, mask and detections are of the photograph as it was taken; without any of them the object is looked for.
     camera: a Camera, or what ``--camera`` takes; without it the photograph's EXIF data, else a field of view of 60
     degrees, with a warning.
     Raises PosekitError's children: ImageError, MeshError, CameraError, PromptError, WeightsError, RenderError.
