@@ -39,7 +39,7 @@ def detect(
             "--model",
             "-m",
             metavar="MESH",
-            help="What to look for; repeat it. Without it anything is reported.",
+            help="Mesh to look for; repeat the option for several. Without it, objects of any kind are reported.",
             rich_help_panel=INPUT,
         ),
     ] = None,
@@ -48,21 +48,33 @@ def detect(
     detector: DetectorOption = None,
     min_score: Annotated[
         float | None,
-        typer.Option(min=0, max=1, help="Leave out detections with a lower score.", rich_help_panel=SCORES),
+        typer.Option(
+            min=0,
+            max=1,
+            help="Drop detections with a lower score (0 to 1). Default: 0.5 with --verify, else the detector's own.",
+            rich_help_panel=SCORES,
+        ),
     ] = None,
     max_detections: Annotated[
-        int, typer.Option(min=1, help="Keep at most so many detections of a mesh (novel).", rich_help_panel=SCORES)
+        int,
+        typer.Option(
+            min=1, help="Largest number of detections of each mesh (--detector novel only).", rich_help_panel=SCORES
+        ),
     ] = 3,
     verify: Annotated[
         bool | None,
         typer.Option(
-            help="Score by the poses found there, a second each; by default with --model and the novel detector.",
+            help="Estimate a pose for each detection (about a second each) and score it by that. Default: on with "
+            "--model and --detector novel.",
             rich_help_panel=SCORES,
         ),
     ] = None,
     threads: ThreadsOption = None,
     scene: Annotated[
-        int | None, typer.Option(help="scene_id for BOP; by default the folder's number.", rich_help_panel=OUTPUT)
+        int | None,
+        typer.Option(
+            help="scene_id in bop.json. Default: the number of the scene's folder, else 0.", rich_help_panel=OUTPUT
+        ),
     ] = None,
     out: OutOption = None,
     force: ForceOption = False,

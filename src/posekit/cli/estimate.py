@@ -43,25 +43,41 @@ from posekit.cli.options import (
 CANDIDATES = 3  # detections of a mesh that are estimated at least, of which the best estimate is kept
 
 InitOption = Annotated[
-    Literal["templates", "mvnet"], typer.Option(help="Where first poses come from.", rich_help_panel=LOOP)
+    Literal["templates", "mvnet"],
+    typer.Option(
+        help="Where first poses come from: templates (renderings compared with the photograph) or mvnet (a network).",
+        rich_help_panel=LOOP,
+    ),
 ]
-HypothesesOption = Annotated[int, typer.Option(metavar="K", help="First poses to refine.", rich_help_panel=LOOP)]
+HypothesesOption = Annotated[
+    int,
+    typer.Option(
+        metavar="K", help="Number of first poses that are refined; the best one is the result.", rich_help_panel=LOOP
+    ),
+]
 TopOption = Annotated[
     int,
     typer.Option(
-        min=1, metavar="N", help="Keep the N best poses of each object: the result and its alternatives.",
+        min=1, metavar="N",
+        help="Keep the N best distinct poses of each object; the others are the result's alternatives.",
         rich_help_panel=LOOP,
     ),
 ]  # fmt: skip
 InstancesOption = Annotated[
-    int, typer.Option(min=1, metavar="N", help="Of each mesh at most, where it is looked for.", rich_help_panel=LOOP)
+    int,
+    typer.Option(
+        min=1,
+        metavar="N",
+        help="Largest number of instances of each mesh to find; used where no box, mask or detections are given.",
+        rich_help_panel=LOOP,
+    ),
 ]
 MinScoreOption = Annotated[
     float | None,
     typer.Option(
         min=0,
         max=1,
-        help="Least score of an estimate; by default 0 where you say where the object is, else 0.5.",
+        help="Drop estimates with a lower score (0 to 1). Default: 0 with --box, --mask or --detections, else 0.5.",
         rich_help_panel=LOOP,
     ),
 ]

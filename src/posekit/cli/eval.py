@@ -44,41 +44,66 @@ def evaluate(
     stage: Annotated[
         Literal["refine", "estimate", "track", "score"],
         typer.Option(
-            help="From disturbed truth; from detections; through sequences; or only score a CSV.", rich_help_panel=STAGE
+            help="What is measured: refine (from disturbed true poses), estimate (from detections), track (through "
+            "sequences), or score (the poses in --csv).",
+            rich_help_panel=STAGE,
         ),
     ] = "estimate",
     dataset: Annotated[
-        str | None, typer.Option(metavar="NAME", help="lmo, lm, linemod, ycbv, tless, ...", rich_help_panel=DATA)
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Name of the data set: lmo, lm, linemod, ycbv, tless, ... Not needed with --root.",
+            rich_help_panel=DATA,
+        ),
     ] = None,
     root: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="The data set, or the folder that holds it.", rich_help_panel=DATA),
+        typer.Option(
+            metavar="DIR",
+            help="Folder of the data set, or the one that holds it. Default: as posekit download has it.",
+            rich_help_panel=DATA,
+        ),
     ] = None,
-    split: Annotated[str | None, typer.Option(help="Folder with the scenes.", rich_help_panel=DATA)] = None,
+    split: Annotated[
+        str | None,
+        typer.Option(help="Name of the folder with the scenes, such as test or test_primesense.", rich_help_panel=DATA),
+    ] = None,
     units: Annotated[
-        Units, typer.Option(help="Of the meshes; auto: BOP's mm, or what models_info.json tells.", rich_help_panel=DATA)
+        Units,
+        typer.Option(
+            help="Length unit of the meshes; auto: mm as in BOP, or what models_info.json shows.", rich_help_panel=DATA
+        ),
     ] = "auto",
     objects: Annotated[
-        str | None, typer.Option(metavar="1,9|ape,duck", help="Only these objects.", rich_help_panel=DATA)
+        str | None,
+        typer.Option(metavar="1,9|ape,duck", help="Only these objects, by number or name.", rich_help_panel=DATA),
     ] = None,
     images: Annotated[
         str | None,
-        typer.Option(metavar="N|SCENE/IMAGE,...", help="N pictures spread evenly, or these.", rich_help_panel=DATA),
+        typer.Option(
+            metavar="N|SCENE/IMAGE,...", help="Only N pictures, spread evenly, or only these.", rich_help_panel=DATA
+        ),
     ] = None,
     min_visible: Annotated[
         float | None,
         typer.Option(
-            metavar="SHARE", help="All instances at least as visible; else the test's targets.", rich_help_panel=DATA
+            metavar="SHARE",
+            help="Measure all instances of which at least this share (0 to 1) is visible. Default: the test's targets.",
+            rich_help_panel=DATA,
         ),
     ] = None,
     detections: Annotated[
         str,
         typer.Option(
-            metavar="gt-boxes|gt-masks|detector|FILE.json", help="What estimate starts from.", rich_help_panel=STAGE
+            metavar="gt-boxes|gt-masks|detector|FILE.json",
+            help="What estimate starts from: true boxes, true masks, the detector, or a file in BOP's format.",
+            rich_help_panel=STAGE,
         ),
     ] = "gt-boxes",
     detector: Annotated[
-        str, typer.Option(metavar="novel|FILE", help="With --detections detector: which.", rich_help_panel=STAGE)
+        str,
+        typer.Option(metavar="novel|FILE", help="With --detections detector: which detector.", rich_help_panel=STAGE),
     ] = "novel",
     masks: Annotated[
         Literal["true", "none"],
@@ -86,11 +111,18 @@ def evaluate(
     ] = "none",
     noise: Annotated[
         str,
-        typer.Option(metavar="DEG,X,Y,Z", help="Refine: standard deviations, degrees and cm.", rich_help_panel=STAGE),
+        typer.Option(
+            metavar="DEG,X,Y,Z",
+            help="refine: standard deviations of the disturbance, in degrees and cm.",
+            rich_help_panel=STAGE,
+        ),
     ] = "15,1,1,5",
-    csv: Annotated[Path | None, typer.Option(metavar="FILE", help="Score: BOP results.", rich_help_panel=STAGE)] = None,
+    csv: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="score: a file of poses in BOP's format.", rich_help_panel=STAGE)
+    ] = None,
     vsd: Annotated[
-        bool, typer.Option("--vsd/--no-vsd", help="VSD, where there is depth.", rich_help_panel=STAGE)
+        bool,
+        typer.Option("--vsd/--no-vsd", help="Compute BOP's VSD, where the data set has depth.", rich_help_panel=STAGE),
     ] = True,
     preset: PresetOption = "lite",
     weights: WeightsOption = None,
@@ -105,23 +137,35 @@ def evaluate(
     colour_edge: ColourEdgeOption = True,
     seed: Annotated[
         int,
-        typer.Option(help="Of the refine stage's disturbances, and of --compare's bootstrap.", rich_help_panel=STAGE),
+        typer.Option(help="Random seed of refine's disturbances and of --compare.", rich_help_panel=STAGE),
     ] = 0,
-    threads: Annotated[int, typer.Option(min=1, help="Of torch, in each worker.", rich_help_panel=LOOP)] = 1,
+    threads: Annotated[
+        int, typer.Option(min=1, help="CPU threads for torch in each process.", rich_help_panel=LOOP)
+    ] = 1,
     device: DeviceOption = "auto",
-    workers: Annotated[int, typer.Option(min=1, help="Processes.", rich_help_panel=LOOP)] = 1,
+    workers: Annotated[int, typer.Option(min=1, help="Number of processes.", rich_help_panel=LOOP)] = 1,
     out: Annotated[
         Path | None,
         typer.Option(
-            metavar="DIR", help="Folder for the results; the same run in it is gone on with.", rich_help_panel=OUTPUT
+            metavar="DIR",
+            help="Folder for the results; an interrupted run of the same command is continued.",
+            rich_help_panel=OUTPUT,
         ),
     ] = None,
     force: Annotated[
-        bool, typer.Option("--force", help="Throw an evaluation in that folder away.", rich_help_panel=OUTPUT)
+        bool,
+        typer.Option(
+            "--force", help="Start anew where --out holds another evaluation, which is deleted.", rich_help_panel=OUTPUT
+        ),
     ] = False,
     comparison: Annotated[
         tuple[Path, Path] | None,
-        typer.Option("--compare", metavar="A B", help="Two result folders side by side.", rich_help_panel=OUTPUT),
+        typer.Option(
+            "--compare",
+            metavar="A B",
+            help="Compare two result folders, with confidence intervals; nothing is measured.",
+            rich_help_panel=OUTPUT,
+        ),
     ] = None,
     json: JsonOption = None,
 ) -> None:

@@ -15,16 +15,29 @@ MaskFrom = Literal["none", "grabcut", "filled"]
 INPUT, LOOP, OUTPUT = "Input", "Refinement", "Output"
 NOT_RELIABLE = 3  # exit code of --require-reliable
 
-ImageArgument = Annotated[Path, typer.Argument(help="The photograph.", show_default=False)]
+ImageArgument = Annotated[Path, typer.Argument(metavar="IMAGE", help="The photograph.", show_default=False)]
 ModelOption = Annotated[
-    Path, typer.Option("--model", "-m", metavar="MESH", help="PLY, OBJ, GLB or STL.", rich_help_panel=INPUT)
+    Path,
+    typer.Option(
+        "--model", "-m", metavar="MESH", help="The object's mesh: PLY, OBJ, GLB or STL.", rich_help_panel=INPUT
+    ),
 ]
 ModelsOption = Annotated[
     list[Path],
-    typer.Option("--model", "-m", metavar="MESH", help="PLY, OBJ, GLB or STL; repeat it.", rich_help_panel=INPUT),
+    typer.Option(
+        "--model",
+        "-m",
+        metavar="MESH",
+        help="The object's mesh: PLY, OBJ, GLB or STL. Repeat the option for several objects.",
+        rich_help_panel=INPUT,
+    ),
 ]
 UnitsOption = Annotated[
-    Units, typer.Option(help="Of the mesh; auto decides by its diameter and says so.", rich_help_panel=INPUT)
+    Units,
+    typer.Option(
+        help="Length unit of the mesh's coordinates; auto decides by the mesh's size and prints its choice.",
+        rich_help_panel=INPUT,
+    ),
 ]
 SymmetryOption = Annotated[
     str | None,
@@ -40,58 +53,96 @@ CameraOption = Annotated[
     str | None,
     typer.Option(
         metavar="fx,fy,cx,cy|FILE",
-        help="Intrinsics in pixels, or a BOP or OpenCV file. Else EXIF, else a 60 degree field of view is assumed.",
+        help="Intrinsics in pixels, or a calibration file (OpenCV, ROS, BOP; lens distortion is removed). Default: "
+        "the focal length in EXIF, else a field of view of 60 degrees.",
         rich_help_panel=INPUT,
     ),
 ]
 BoxOption = Annotated[
     str | None,
-    typer.Option(metavar="x0,y0,x1,y1", help="Box round the object, pixels.", rich_help_panel=INPUT),
+    typer.Option(
+        metavar="x0,y0,x1,y1",
+        help="Bounding box of the object in the photograph: left, top, right, bottom, pixels.",
+        rich_help_panel=INPUT,
+    ),
 ]
 MaskOption = Annotated[
     Path | None,
-    typer.Option(metavar="PNG", help="The object's mask, of the photograph's size.", rich_help_panel=INPUT),
+    typer.Option(
+        metavar="PNG",
+        help="Mask of the object: white where it is seen, of the photograph's size.",
+        rich_help_panel=INPUT,
+    ),
 ]
 DetectionsOption = Annotated[
     Path | None,
     typer.Option(
-        metavar="JSON", help="Detections of another program, as BOP or COCO have them.", rich_help_panel=INPUT
+        metavar="JSON", help="Boxes or masks from another program, in COCO's or BOP's format.", rich_help_panel=INPUT
     ),
 ]
 DetectorOption = Annotated[
     str | None,
     typer.Option(
         metavar="novel|coco|FILE",
-        help="Who looks for the object where nothing else says where it is: novel (the default) needs no training.",
+        help="Detector that finds the object: novel (default; any mesh, no training), coco (COCO's classes), or a "
+        "file of posekit train detector.",
         rich_help_panel=INPUT,
     ),
 ]
 MaskFromOption = Annotated[
-    MaskFrom, typer.Option(help="How a box becomes a mask; first poses need none.", rich_help_panel=INPUT)
+    MaskFrom,
+    typer.Option(
+        help="Mask made from --box: none, grabcut (segmented by colour), or filled (the whole box).",
+        rich_help_panel=INPUT,
+    ),
 ]
 
-PresetOption = Annotated[str, typer.Option(help="The networks: lite or paper.", rich_help_panel=LOOP)]
+PresetOption = Annotated[
+    str,
+    typer.Option(
+        help="Network architecture: lite, or paper (as published, which needs --weights).", rich_help_panel=LOOP
+    ),
+]
 WeightsOption = Annotated[
     Path | None,
-    typer.Option(metavar="FILE", help="Weights in place of the shipped ones.", rich_help_panel=LOOP),
+    typer.Option(
+        metavar="FILE",
+        help="Network weights to use in place of the shipped ones: a file or folder of posekit train pose.",
+        rich_help_panel=LOOP,
+    ),
 ]
 UpdateOption = Annotated[
     Update,
-    typer.Option(help="What moves the pose; auto: correspondences where the network gives them.", rich_help_panel=LOOP),
+    typer.Option(
+        help="How the network's output moves the pose: by 2D-2D correspondences and PnP, or by its regressed pose "
+        "change. auto: correspondences where the network has them.",
+        rich_help_panel=LOOP,
+    ),
 ]
 StopOption = Annotated[
     Stop,
-    typer.Option(help="At a predicted angle (the paper), or after a fixed number (DeepIM).", rich_help_panel=LOOP),
+    typer.Option(
+        help="When refinement ends: angle, once the predicted rotation error is below --stop-angle; fixed, after "
+        "--iterations.",
+        rich_help_panel=LOOP,
+    ),
 ]
-IterationsOption = Annotated[int, typer.Option(help="At most; with --stop fixed exactly.", rich_help_panel=LOOP)]
+IterationsOption = Annotated[
+    int,
+    typer.Option(
+        help="Largest number of refinement iterations; with --stop fixed the exact number.", rich_help_panel=LOOP
+    ),
+]
 StopAngleOption = Annotated[
-    float, typer.Option(metavar="DEGREES", help="Predicted angle that ends the loop.", rich_help_panel=LOOP)
+    float,
+    typer.Option(metavar="DEGREES", help="Predicted rotation error below which refinement ends.", rich_help_panel=LOOP),
 ]
 PerturbOption = Annotated[
     bool,
     typer.Option(
         "--perturb/--no-perturb",
-        help="Also try poses turned by 12 degrees from the given one where that does not converge at once.",
+        help="Where the given pose does not converge within a few iterations, also start from four poses turned by "
+        "12 degrees.",
         rich_help_panel=LOOP,
     ),
 ]
@@ -99,7 +150,7 @@ MaskEdgeOption = Annotated[
     bool,
     typer.Option(
         "--mask-edge/--no-mask-edge",
-        help="Fit the pose to the edge of the given mask, where the mask proves exact to the pixel.",
+        help="At the end, fit the silhouette to the edge of the mask, where that mask proves exact to the pixel.",
         rich_help_panel=LOOP,
     ),
 ]
@@ -107,16 +158,16 @@ ColourEdgeOption = Annotated[
     bool,
     typer.Option(
         "--colour-edge/--no-colour-edge",
-        help="Fit poses to the silhouette's edge as the photograph's colours show it, where no exact mask decides.",
+        help="Also fit the silhouette to the edge between the object's colours and the background's.",
         rich_help_panel=LOOP,
     ),
 ]
 DeviceOption = Annotated[
     Literal["auto", "cpu", "cuda"],
-    typer.Option(help="What the networks run on; auto takes a GPU where there is one.", rich_help_panel=LOOP),
+    typer.Option(help="Where the networks run; auto: on a GPU where there is one.", rich_help_panel=LOOP),
 ]
 ThreadsOption = Annotated[
-    int | None, typer.Option(min=1, help="Threads of torch; by default its own choice.", rich_help_panel=LOOP)
+    int | None, typer.Option(min=1, help="CPU threads for torch; by default torch decides.", rich_help_panel=LOOP)
 ]
 
 
@@ -133,15 +184,16 @@ FormatOption = Annotated[
     typer.Option(
         "--format",
         metavar="csv|ros|blender|unity|tum|json",
-        help="Also write the poses for other programs: objects.csv, ros.yaml, blender.json, unity.json or NAME.tum; "
-        "repeat it. json is result.json, which is written anyway.",
+        help="Also write the poses for other programs: objects.csv, ros.yaml, blender.json, unity.json or MESH.tum. "
+        "Repeat the option for several. json is posekit's own, which is written in any case.",
         rich_help_panel=OUTPUT,
     ),
 ]
 BlendOption = Annotated[
     float,
     typer.Option(
-        min=0, max=1, metavar="SHARE", help="How much of the rendered mesh the overlay shows, 0 to 1.",
+        min=0, max=1, metavar="SHARE",
+        help="Opacity of the rendered mesh in the overlay: 0 (contour and axes only) to 1.",
         rich_help_panel=OUTPUT,
     ),
 ]  # fmt: skip
@@ -149,8 +201,7 @@ RequireReliableOption = Annotated[
     bool,
     typer.Option(
         "--require-reliable",
-        help="End with exit code 3 where a result is not reliable, or nothing is found; results are written all the "
-        "same.",
+        help="Exit with code 3 if a result is not reliable or nothing is found. Results are written in any case.",
         rich_help_panel=OUTPUT,
     ),
 ]
@@ -166,19 +217,25 @@ OutOption = Annotated[
     Path | None,
     typer.Option(
         metavar="DIR",
-        help="Folder for the results, new or empty. By default one in posekit-out, or in the next free posekit-out-2, "
-        "-3; with --json none.",
+        help="Folder for the results, new or empty. Default: a folder in posekit-out, or in posekit-out-2 and so on "
+        "where that holds results; none if --json is given.",
         rich_help_panel=OUTPUT,
     ),
 ]
 ForceOption = Annotated[
-    bool, typer.Option("--force", help="Write into a folder that holds files already.", rich_help_panel=OUTPUT)
+    bool,
+    typer.Option(
+        "--force",
+        help="Write into --out even if it holds files; files of the same names are replaced.",
+        rich_help_panel=OUTPUT,
+    ),
 ]
 JsonOption = Annotated[
     str | None,
     typer.Option(
         metavar="FILE|-",
-        help="Write the result as JSON to FILE, or with - to standard output, where then nothing else is written.",
+        help="Write the result as JSON to FILE. With - it goes to standard output, and everything else to standard "
+        "error.",
         rich_help_panel=OUTPUT,
     ),
 ]

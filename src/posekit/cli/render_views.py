@@ -19,14 +19,19 @@ _THUMBNAIL = 240  # pixels, longer side of a picture in the contact sheet
 
 def render_views(
     model: ModelOption,
-    views: Annotated[int, typer.Option(help="6: the faces of a cube; else evenly over the sphere.")] = 6,
+    views: Annotated[
+        int,
+        typer.Option(help="Number of views: 6 are along the axes, any other number is spread evenly over the sphere."),
+    ] = 6,
     out: Annotated[
         Path | None,
         typer.Option(
-            metavar="DIR", help="New or empty. By default posekit-out/MESH-views, or posekit-out-2 and so on."
+            metavar="DIR",
+            help="Folder for the views, new or empty. Default: posekit-out/MESH-views, or posekit-out-2/MESH-views "
+            "and so on.",
         ),
     ] = None,
-    size: Annotated[str, typer.Option(metavar="WxH", help="Of each view, pixels.")] = "640x480",
+    size: Annotated[str, typer.Option(metavar="WxH", help="Width and height of each view, pixels.")] = "640x480",
     units: UnitsOption = "auto",
     force: ForceOption = False,
     json: JsonOption = None,

@@ -47,42 +47,65 @@ COLUMNS = "scene_id,im_id,obj_id,score,R,t,time"
 
 def track(
     source: Annotated[
-        str, typer.Argument(help="A video, a folder or glob of pictures, a BOP scene, or a camera's number.")
+        str,
+        typer.Argument(
+            metavar="SOURCE",
+            help="A video file, a folder or glob of pictures, a BOP scene, or the number of a camera (0).",
+        ),
     ],
     model: ModelsOption,
     camera: CameraOption = None,
     pose: Annotated[
         list[Path] | None,
-        typer.Option(metavar="FILE", help="First pose, as refine takes it; once for each mesh.", rich_help_panel=INPUT),
+        typer.Option(
+            metavar="FILE",
+            help="Pose in the first frame, in a file as refine --pose takes it; one for each --model, in the same "
+            "order. Default: the object is detected.",
+            rich_help_panel=INPUT,
+        ),
     ] = None,
     detector: DetectorOption = None,
     units: UnitsOption = "auto",
     symmetry: SymmetryOption = None,
     preset: PresetOption = "lite",
     weights: WeightsOption = None,
-    iterations: Annotated[int, typer.Option(help="Comparisons of a frame at most.", rich_help_panel=LOOP)] = 1,
+    iterations: Annotated[
+        int, typer.Option(help="Largest number of network passes for each frame.", rich_help_panel=LOOP)
+    ] = 1,
     restart_angle: Annotated[
-        float, typer.Option(metavar="DEGREES", help="Predicted angle that restarts.", rich_help_panel=LOOP)
+        float,
+        typer.Option(
+            metavar="DEGREES",
+            help="Predicted rotation error above which the object is detected anew.",
+            rich_help_panel=LOOP,
+        ),
     ] = 25.0,
     still_angle: Annotated[
         float,
         typer.Option(
             metavar="DEGREES",
-            help="Predicted angle below which the network leaves the pose as it is; the paper has 2.",
+            help="Predicted rotation error below which the network does not move the pose (the paper: 2).",
             rich_help_panel=LOOP,
         ),
     ] = 0.0,
     runtime: Annotated[
-        Literal["openvino", "torch"], typer.Option(help="Of the network.", rich_help_panel=LOOP)
+        Literal["openvino", "torch"], typer.Option(help="Library that runs the network.", rich_help_panel=LOOP)
     ] = "openvino",
     threads: ThreadsOption = None,
     device: DeviceOption = "auto",
-    overlay: Annotated[bool, typer.Option(help="Write overlay.mp4.", rich_help_panel=OUTPUT)] = True,
+    overlay: Annotated[
+        bool, typer.Option(help="Write a video with the poses drawn in, overlay.mp4.", rich_help_panel=OUTPUT)
+    ] = True,
     rerun: RerunOption = False,
     live: Annotated[
-        bool, typer.Option("--live", help="Drop frames to keep up with a camera.", rich_help_panel=OUTPUT)
+        bool,
+        typer.Option(
+            "--live", help="For cameras: skip frames that come while one is worked on.", rich_help_panel=OUTPUT
+        ),
     ] = False,
-    frames: Annotated[int | None, typer.Option(min=1, help="Frames at most.", rich_help_panel=OUTPUT)] = None,
+    frames: Annotated[
+        int | None, typer.Option(min=1, help="Stop after so many frames.", rich_help_panel=OUTPUT)
+    ] = None,
     out: OutOption = None,
     force: ForceOption = False,
     json: JsonOption = None,

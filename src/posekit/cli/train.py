@@ -29,76 +29,115 @@ def _train() -> None:
 
 @train.command("pose", cls=Command)
 def pose(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the weights, curves and checkpoints.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for weights, curves and checkpoints.")],
     model: Annotated[
         list[Path] | None,
         typer.Option(
-            "--model", "-m", metavar="MESH", help="An object to train for; repeat it.", rich_help_panel=SOURCES
+            "--model",
+            "-m",
+            metavar="MESH",
+            help="Mesh to train for; repeat the option for several.",
+            rich_help_panel=SOURCES,
         ),
     ] = None,
     meshes: Annotated[
-        list[Path] | None, typer.Option(metavar="DIR", help="A folder of meshes.", rich_help_panel=SOURCES)
+        list[Path] | None, typer.Option(metavar="DIR", help="Folder of meshes to train for.", rich_help_panel=SOURCES)
     ] = None,
-    units: Annotated[Units | None, typer.Option(help="Of the meshes; auto.", rich_help_panel=SOURCES)] = None,
+    units: Annotated[
+        Units | None,
+        typer.Option(
+            help="Length unit of the meshes' coordinates. Default: auto, by their size.", rich_help_panel=SOURCES
+        ),
+    ] = None,
     bop: Annotated[
         list[str] | None,
-        typer.Option(metavar="DIR[:SPLIT][=WEIGHT]", help="A BOP data set (paper recipe).", rich_help_panel=SOURCES),
+        typer.Option(
+            metavar="DIR[:SPLIT][=WEIGHT]",
+            help="BOP data set to train on (recipe paper only), with its split and its weight among several.",
+            rich_help_panel=SOURCES,
+        ),
     ] = None,
     backgrounds: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Photographs for backgrounds.", rich_help_panel=SOURCES)
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Folder of photographs for the backgrounds. Default: procedural ones.",
+            rich_help_panel=SOURCES,
+        ),
     ] = None,
     init: Annotated[
         str | None,
         typer.Option(
             metavar="WEIGHTS|shipped|none",
-            help="Weights to start from; by default the shipped ones for given meshes, without --config.",
+            help="Weights to start from. Default: the shipped ones if meshes are given and --config is not, else none.",
             rich_help_panel=SOURCES,
         ),
     ] = None,
     flownets: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="FlowNetS checkpoint for the paper's encoder.", rich_help_panel=SOURCES),
+        typer.Option(
+            metavar="FILE",
+            help="FlowNetS checkpoint to start the encoder of recipe paper from.",
+            rich_help_panel=SOURCES,
+        ),
     ] = None,
     validate_on: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="A BOP data set to measure on.", rich_help_panel=SOURCES)
+        Path | None,
+        typer.Option(metavar="DIR", help="BOP data set to measure on during training.", rich_help_panel=SOURCES),
     ] = None,
-    recipe: Annotated[Literal["lite", "paper"] | None, typer.Option(help="What is trained, and how.")] = None,
-    config: Annotated[Path | None, typer.Option(metavar="TOML", help="Everything else; options override it.")] = None,
-    minutes: Annotated[float | None, typer.Option(help="Of wall clock.", rich_help_panel=SCHEDULE)] = None,
-    steps: Annotated[int | None, typer.Option(help="Optimiser steps.", rich_help_panel=SCHEDULE)] = None,
-    batch: Annotated[int | None, typer.Option(help="Samples per process and step.", rich_help_panel=SCHEDULE)] = None,
+    recipe: Annotated[
+        Literal["lite", "paper"] | None,
+        typer.Option(help="Network and training: lite (default), or paper (as published)."),
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option(metavar="TOML", help="File with all settings; options given here override it.")
+    ] = None,
+    minutes: Annotated[float | None, typer.Option(help="Stop after so many minutes.", rich_help_panel=SCHEDULE)] = None,
+    steps: Annotated[
+        int | None, typer.Option(help="Stop after so many optimiser steps.", rich_help_panel=SCHEDULE)
+    ] = None,
+    batch: Annotated[
+        int | None, typer.Option(help="Samples in each process and step.", rich_help_panel=SCHEDULE)
+    ] = None,
     rate: Annotated[float | None, typer.Option(help="Highest learning rate.", rich_help_panel=SCHEDULE)] = None,
     mvnet: Annotated[
         int | None,
         typer.Option(
             min=0,
-            help="MV-Net's samples beside them; by default 8, but 0 where shipped weights learn given meshes, "
-            "which leaves the first pose to the template search.",
+            help="Samples of MV-Net (the first-pose network) in each step; 0 does not train it. Default: 0 where the "
+            "shipped weights are trained on given meshes, else 8.",
             rich_help_panel=SCHEDULE,
         ),
     ] = None,
     seed: Annotated[
-        int | None, typer.Option(help="The same seed gives the same result.", rich_help_panel=SCHEDULE)
+        int | None, typer.Option(help="Random seed; the same one gives the same result.", rich_help_panel=SCHEDULE)
     ] = None,
     overfit: Annotated[
-        bool, typer.Option("--overfit", help="Train on one batch only.", rich_help_panel=SCHEDULE)
+        bool, typer.Option("--overfit", help="Train on a single batch only, as a check.", rich_help_panel=SCHEDULE)
     ] = False,
-    devices: Annotated[int | None, typer.Option(help="Processes on this machine.", rich_help_panel=MACHINE)] = None,
-    num_nodes: Annotated[int | None, typer.Option(help="Machines.", rich_help_panel=MACHINE)] = None,
+    devices: Annotated[
+        int | None, typer.Option(help="Number of training processes on this machine.", rich_help_panel=MACHINE)
+    ] = None,
+    num_nodes: Annotated[int | None, typer.Option(help="Number of machines.", rich_help_panel=MACHINE)] = None,
     accelerator: Annotated[
-        Literal["auto", "cpu", "cuda"] | None, typer.Option(help="What computes.", rich_help_panel=MACHINE)
+        Literal["auto", "cpu", "cuda"] | None,
+        typer.Option(help="Where the training runs; auto: on a GPU where there is one.", rich_help_panel=MACHINE),
     ] = None,
     precision: Annotated[
         Literal["auto", "32-true", "bf16-mixed", "16-mixed"] | None,
-        typer.Option(help="Of numbers.", rich_help_panel=MACHINE),
+        typer.Option(help="Number format of the computation; auto decides by the device.", rich_help_panel=MACHINE),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(help="Processes that render, for each that trains.", rich_help_panel=MACHINE)
+        int | None, typer.Option(help="Rendering processes for each training process.", rich_help_panel=MACHINE)
     ] = None,
-    threads: Annotated[int | None, typer.Option(help="Threads of torch per process.", rich_help_panel=MACHINE)] = None,
-    profile: Annotated[bool, typer.Option("--profile", help="Write profile.txt.", rich_help_panel=MACHINE)] = False,
+    threads: Annotated[
+        int | None, typer.Option(help="CPU threads for torch in each process.", rich_help_panel=MACHINE)
+    ] = None,
+    profile: Annotated[
+        bool, typer.Option("--profile", help="Write where the time goes to profile.txt.", rich_help_panel=MACHINE)
+    ] = False,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with the training in --out, as it was begun.")
+        bool, typer.Option("--resume", help="Continue the training in --out with the settings it was begun with.")
     ] = False,
     force: ForceOption = False,
 ) -> None:
@@ -132,19 +171,30 @@ def pose(
 
 @train.command("angle", cls=Command)
 def angle(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the weights.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the new weights.")],
     weights: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Weights to start from, in place of the shipped ones.")
     ] = None,
-    preset: Annotated[Literal["lite", "paper"], typer.Option(help="The networks.")] = "lite",
+    preset: Annotated[
+        Literal["lite", "paper"], typer.Option(help="Network architecture of the shipped weights.")
+    ] = "lite",
     model: Annotated[
-        list[Path] | None, typer.Option("--model", "-m", metavar="MESH", help="An object; repeat it.")
+        list[Path] | None,
+        typer.Option("--model", "-m", metavar="MESH", help="Mesh to render; repeat the option for several."),
     ] = None,
-    meshes: Annotated[list[Path] | None, typer.Option(metavar="DIR", help="A folder of meshes.")] = None,
-    share: Annotated[float, typer.Option(min=0, max=1, help="Of the meshes; the rest is procedural.")] = 1.0,
+    meshes: Annotated[list[Path] | None, typer.Option(metavar="DIR", help="Folder of meshes to train for.")] = None,
+    share: Annotated[
+        float,
+        typer.Option(
+            min=0, max=1, help="Share of the renderings that show the meshes; the rest shows procedural shapes."
+        ),
+    ] = 1.0,
     units: Annotated[Units, typer.Option(help="Of the meshes.")] = "auto",
-    backgrounds: Annotated[Path | None, typer.Option(metavar="DIR", help="Photographs for backgrounds.")] = None,
-    cases: Annotated[int, typer.Option(min=1, help="Renderings to refine.")] = 240,
+    backgrounds: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Folder of photographs for the backgrounds. Default: procedural ones."),
+    ] = None,
+    cases: Annotated[int, typer.Option(min=1, help="Number of renderings that are refined.")] = 240,
 ) -> None:
     """Fit the predicted angle alone to what refinement leaves; `train pose` does so at its end."""
     from posekit.train.config import changed, default_config
@@ -234,58 +284,95 @@ def _bar() -> Iterator[Show]:
 
 @train.command("detector", cls=Command)
 def detector(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the weights, curves and checkpoints.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for weights, curves and checkpoints.")],
     models: Annotated[
         list[Path] | None,
         typer.Option(
-            "--models", "--model", "-m", metavar="MESH", help="What to find; repeat it.", rich_help_panel=SOURCES
+            "--models",
+            "--model",
+            "-m",
+            metavar="MESH",
+            help="Mesh to find; repeat the option for several.",
+            rich_help_panel=SOURCES,
         ),
     ] = None,
     meshes: Annotated[
-        list[Path] | None, typer.Option(metavar="DIR", help="A folder of meshes.", rich_help_panel=SOURCES)
+        list[Path] | None, typer.Option(metavar="DIR", help="Folder of meshes to train for.", rich_help_panel=SOURCES)
     ] = None,
     agnostic: Annotated[
-        bool, typer.Option("--agnostic", help="Objects of any kind, as one class.", rich_help_panel=SOURCES)
+        bool,
+        typer.Option("--agnostic", help="Learn to find objects of any kind, as one class.", rich_help_panel=SOURCES),
     ] = False,
     distractors: Annotated[
         list[Path] | None,
         typer.Option(
-            metavar="DIR", help="A folder of meshes that lie about, not to be found.", rich_help_panel=SOURCES
+            metavar="DIR",
+            help="Folder of meshes that are in the scenes but are not to be found.",
+            rich_help_panel=SOURCES,
         ),
     ] = None,
-    units: Annotated[Units | None, typer.Option(help="Of the meshes; auto.", rich_help_panel=SOURCES)] = None,
+    units: Annotated[
+        Units | None,
+        typer.Option(
+            help="Length unit of the meshes' coordinates. Default: auto, by their size.", rich_help_panel=SOURCES
+        ),
+    ] = None,
     backgrounds: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Photographs for backgrounds.", rich_help_panel=SOURCES)
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Folder of photographs for the backgrounds. Default: procedural ones.",
+            rich_help_panel=SOURCES,
+        ),
     ] = None,
     init: Annotated[
         str | None,
         typer.Option(
-            metavar="WEIGHTS|novel", help="A detector to start from; else ImageNet's backbone.", rich_help_panel=SOURCES
+            metavar="WEIGHTS|novel",
+            help="Detector weights to start from; novel: the shipped ones. Default: ImageNet's backbone alone.",
+            rich_help_panel=SOURCES,
         ),
     ] = None,
-    backbone: Annotated[Literal["lite0", "resnet50"] | None, typer.Option(help="Light, or the paper's.")] = None,
-    config: Annotated[Path | None, typer.Option(metavar="TOML", help="Everything else; options override it.")] = None,
-    minutes: Annotated[float | None, typer.Option(help="Of wall clock.", rich_help_panel=SCHEDULE)] = None,
-    epochs: Annotated[int | None, typer.Option(help="Of 2000 scenes.", rich_help_panel=SCHEDULE)] = None,
-    steps: Annotated[int | None, typer.Option(help="Optimiser steps.", rich_help_panel=SCHEDULE)] = None,
-    batch: Annotated[int | None, typer.Option(help="Scenes per process and step.", rich_help_panel=SCHEDULE)] = None,
+    backbone: Annotated[
+        Literal["lite0", "resnet50"] | None,
+        typer.Option(help="Backbone: lite0 (default, light) or resnet50 (the paper's)."),
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option(metavar="TOML", help="File with all settings; options given here override it.")
+    ] = None,
+    minutes: Annotated[float | None, typer.Option(help="Stop after so many minutes.", rich_help_panel=SCHEDULE)] = None,
+    epochs: Annotated[
+        int | None, typer.Option(help="Stop after so many epochs of 2000 scenes.", rich_help_panel=SCHEDULE)
+    ] = None,
+    steps: Annotated[
+        int | None, typer.Option(help="Stop after so many optimiser steps.", rich_help_panel=SCHEDULE)
+    ] = None,
+    batch: Annotated[
+        int | None, typer.Option(help="Scenes in each process and step.", rich_help_panel=SCHEDULE)
+    ] = None,
     rate: Annotated[float | None, typer.Option(help="Highest learning rate.", rich_help_panel=SCHEDULE)] = None,
     seed: Annotated[
-        int | None, typer.Option(help="The same seed gives the same result.", rich_help_panel=SCHEDULE)
+        int | None, typer.Option(help="Random seed; the same one gives the same result.", rich_help_panel=SCHEDULE)
     ] = None,
-    devices: Annotated[int | None, typer.Option(help="Processes on this machine.", rich_help_panel=MACHINE)] = None,
+    devices: Annotated[
+        int | None, typer.Option(help="Number of training processes on this machine.", rich_help_panel=MACHINE)
+    ] = None,
     accelerator: Annotated[
-        Literal["auto", "cpu", "cuda"] | None, typer.Option(help="What computes.", rich_help_panel=MACHINE)
+        Literal["auto", "cpu", "cuda"] | None,
+        typer.Option(help="Where the training runs; auto: on a GPU where there is one.", rich_help_panel=MACHINE),
     ] = None,
     precision: Annotated[
-        Literal["32-true", "bf16-mixed", "16-mixed"] | None, typer.Option(help="Of numbers.", rich_help_panel=MACHINE)
+        Literal["32-true", "bf16-mixed", "16-mixed"] | None,
+        typer.Option(help="Number format of the computation; auto decides by the device.", rich_help_panel=MACHINE),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(help="Processes that render, for each that trains.", rich_help_panel=MACHINE)
+        int | None, typer.Option(help="Rendering processes for each training process.", rich_help_panel=MACHINE)
     ] = None,
-    threads: Annotated[int | None, typer.Option(help="Threads of torch per process.", rich_help_panel=MACHINE)] = None,
+    threads: Annotated[
+        int | None, typer.Option(help="CPU threads for torch in each process.", rich_help_panel=MACHINE)
+    ] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with the training in --out, as it was begun.")
+        bool, typer.Option("--resume", help="Continue the training in --out with the settings it was begun with.")
     ] = False,
     force: ForceOption = False,
 ) -> None:
