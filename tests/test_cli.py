@@ -182,7 +182,7 @@ def test_quiet_and_verbose(invoke: Invoke, monkeypatch: pytest.MonkeyPatch) -> N
     assert "T_cam_obj" in quiet.stdout and "note:" not in quiet.stderr
     assert "warning: photo.png: its camera is not known" in quiet.stderr
     told = invoke("estimate", None, "--verbose", "--min-score", "0").stderr
-    for words in ("debug: loading the networks: ", "debug: toy: 5 first poses in ", "debug: toy: pose 1 of 5: score "):
+    for words in ("debug: loading the networks: ", "debug: toy: 5 first poses in ", "debug: toy: pose 1 of 5: rank "):
         assert words in told, told
     front = CliRunner().invoke(app, ["-q", "estimate", "a.png", "--model", "b.ply", "--least", "0"])
     assert front.exit_code == 1 and front.stderr.startswith("error:"), "before the command too; the notice is a note"

@@ -16,8 +16,9 @@ from jsonschema import Draft202012Validator, ValidationError
 from typer.testing import CliRunner
 
 from posekit.cli.app import app
+from posekit.detect.external import DetectionsFile
 from posekit.errors import PromptError
-from posekit.io.load import load_pose
+from posekit.io.load import load_pose, load_view
 from posekit.mesh.model import ObjectModel
 from posekit.nets.weights import build, save_networks
 from posekit.render import Renderer
@@ -142,6 +143,17 @@ def test_detect_writes_what_the_schema_says(folder: Path, monkeypatch: pytest.Mo
     assert "toy: score 0.90" in run(folder, "detect", "photo.png", "--json", "detections.json", "--out", "out")
     assert json.loads((tmp_path / "detections.json").read_text())["detections"] == found["detections"]
     assert (tmp_path / "out" / "coco.json").exists()
+
+    for camera in (CAMERA, str(folder / "lens.json")):  # read back, they are of the undistorted picture already
+        view, model = load_view(folder / "photo.png", camera), ObjectModel.load(folder / "toy.ply", units="m")
+        written = run(folder, "detect", "photo.png", "--json", "-", camera=camera)
+        (tmp_path / "detections.json").write_text(written)
+        best, other = DetectionsFile.read(tmp_path / "detections.json", folder / "photo.png").detect(view, [model])
+        assert (best.box, best.score, best.source, other.mask) == (MASKED, 0.9, Source.FILE, None)
+        assert best.mask is not None and best.mask.sum() == 150 * 190
+    (tmp_path / "newer.json").write_text(json.dumps({**json.loads(written), "schema_version": 2}))
+    with pytest.raises(PromptError, match=r"newer\.json has schema_version 2"):
+        DetectionsFile.read(tmp_path / "newer.json", folder / "photo.png")
 
 
 def test_track_on_standard_output(folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

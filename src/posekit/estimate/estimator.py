@@ -168,7 +168,7 @@ class PoseEstimator:
         order = np.argsort([-s for s in scores], kind="stable")
         for place, k in enumerate(order):
             log.debug(
-                "%s: pose %d of %d%s: score %.3f, expected rotation error %.1f degrees, %d iterations", self.model.name,
+                "%s: pose %d of %d%s: rank %.3f, expected rotation error %.1f degrees, %d iterations", self.model.name,
                 place + 1, len(order), "" if place < count else " (dropped)", scores[k],
                 np.rad2deg(candidates[k].angle), candidates[k].iterations,
             )  # fmt: skip
