@@ -35,8 +35,8 @@ CSV_COLUMNS = [
     "reliable",
 ]
 ROS_FRAME = "camera_optical_frame"  # as REP 103 names OpenCV's axes
-# From OpenCV's camera axes to those of a camera in Blender and OpenGL (x right, y up, z backwards) and in Unity (x right,
-# y up, z forward: left-handed); and from a mesh's axes to those that Unity's importers give it.
+# From OpenCV's camera axes to those of a camera in Blender and OpenGL (x right, y up, z backwards) and in Unity (x
+# right, y up, z forward: left-handed); and from a mesh's axes to those that Unity's importers give it.
 BLENDER_CAMERA = OPENGL_CAMERA = np.diag([1.0, -1.0, -1.0])
 UNITY_CAMERA = np.diag([1.0, -1.0, 1.0])
 UNITY_MESH = np.diag([-1.0, 1.0, 1.0])
