@@ -11,12 +11,14 @@ from typing import Any
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).resolve().parent.parent
+OUTSIDE = {"index.md": "README.md", "changelog.md": "CHANGELOG.md"}
+OUTSIDE |= {"contributing.md": "CONTRIBUTING.md", "security.md": "SECURITY.md"}
 COMMAND_LINE = [sys.executable, "-m", "typer", "posekit.cli.app", "utils", "docs", "--name", "posekit"]
 
 
 def on_config(config: Any) -> Any:
     """Fill in the list of decisions; leave out pages that are not there, other than the generated ones."""
-    made = {"index.md", "changelog.md", "examples.md", "command-line.md"}
+    made = {*OUTSIDE, "examples.md", "command-line.md"}
     decisions = sorted(f"decisions/{file.name}" for file in (ROOT / "docs/decisions").glob("*.md"))
 
     def kept(entry: dict[str, Any]) -> dict[str, Any] | None:
@@ -35,8 +37,7 @@ def on_files(files: Files, config: Any) -> Files:
     """Add the generated pages."""
     command_line = subprocess.run(COMMAND_LINE, cwd=ROOT, check=True, capture_output=True, text=True).stdout
     pages = {
-        "index.md": (ROOT / "README.md").read_text(encoding="utf-8"),
-        "changelog.md": (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"),
+        **{page: (ROOT / name).read_text(encoding="utf-8") for page, name in OUTSIDE.items()},
         "examples.md": "# Examples\nShort programs of `examples/`; the tests run them.\n"
         + "".join(
             f"\n## {file.stem}\n```python\n{file.read_text(encoding='utf-8')}```\n"
@@ -51,8 +52,11 @@ def on_files(files: Files, config: Any) -> Files:
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Links as files have them, which hold in the repository, become links between pages."""
-    if page.file.src_uri in ("index.md", "changelog.md"):
-        markdown = re.sub(r"\]\(docs/decisions\)", "](decisions/0001-set-up-checks-and-command-line.md)", markdown)
+    if page.file.src_uri in OUTSIDE:
+        markdown = markdown.replace("](docs/decisions)", "](decisions/0001-set-up-checks-and-command-line.md)")
         markdown = markdown.replace("](docs/", "](").replace("[Apache-2.0](LICENSE)", "Apache-2.0")
+        markdown = markdown.replace("<details>", '<details markdown="1">')
+        for target, name in OUTSIDE.items():
+            markdown = markdown.replace(f"]({name})", f"]({target})")
     markdown = re.sub(r"\]\((?:\.\./)?examples/(\w+)\.py\)", r"](examples.md#\1)", markdown)
     return re.sub(r"\]\((?:\.\./)?examples(?:/[\w.]+)?\)", "](examples.md)", markdown)

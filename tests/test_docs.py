@@ -30,7 +30,7 @@ from posekit.synth.example import Example, make_example, make_film, ply
 from posekit.train.config import read_config
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 ELSEWHERE = {"calibration.md": "test_calibrate.py"}  # pages whose blocks another test runs
 UNMARKED = {"calibration.md", "log.md"}  # pages whose commands are run elsewhere, or are history
 # what makes a command short: of an option given twice the last one counts
@@ -166,12 +166,12 @@ def test_configurations_are_read(block: Block, tmp_path: Path) -> None:
 
 def test_site_is_built_without_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NO_MKDOCS_2_WARNING", "1")
-    commands = pytest.importorskip("mkdocs.commands.build", reason="needs the extra docs")
+    from mkdocs.commands.build import build
     from mkdocs.config import load_config
 
     config = load_config(str(ROOT / "mkdocs.yml"), site_dir=str(tmp_path / "site"))
     try:
-        commands.build(config)  # strict: a warning ends it
+        build(config)  # strict: a warning ends it
     except click.ClickException as error:
         pytest.fail(error.format_message())
     finally:
