@@ -11,14 +11,13 @@ from typing import Any
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).resolve().parent.parent
-OUTSIDE = {"index.md": "README.md", "changelog.md": "CHANGELOG.md"}
-OUTSIDE |= {"contributing.md": "CONTRIBUTING.md", "security.md": "SECURITY.md"}
+OUTSIDE = {"index.md": "README.md"} | {f"{n.lower()}.md": f"{n}.md" for n in ("CHANGELOG", "CONTRIBUTING", "SECURITY")}
+MADE = {*OUTSIDE, "examples.md", "command-line.md"}
 COMMAND_LINE = [sys.executable, "-m", "typer", "posekit.cli.app", "utils", "docs", "--name", "posekit"]
 
 
 def on_config(config: Any) -> Any:
     """Fill in the list of decisions; leave out pages that are not there, other than the generated ones."""
-    made = {*OUTSIDE, "examples.md", "command-line.md"}
     decisions = sorted(f"decisions/{file.name}" for file in (ROOT / "docs/decisions").glob("*.md"))
 
     def kept(entry: dict[str, Any]) -> dict[str, Any] | None:
@@ -27,7 +26,7 @@ def on_config(config: Any) -> Any:
             return {title: decisions}
         if isinstance(target, list):
             return {title: [each for each in map(kept, target) if each]}
-        return entry if target in made or (ROOT / "docs" / target).exists() else None
+        return entry if target in MADE or (ROOT / "docs" / target).exists() else None
 
     config.nav = [each for each in map(kept, config.nav) if each]
     return config
@@ -36,14 +35,12 @@ def on_config(config: Any) -> Any:
 def on_files(files: Files, config: Any) -> Files:
     """Add the generated pages."""
     command_line = subprocess.run(COMMAND_LINE, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    examples = sorted((ROOT / "examples").glob("*.py"))
+    programs = [f"\n## {file.stem}\n```python\n{file.read_text(encoding='utf-8')}```\n" for file in examples]
     pages = {
         **{page: (ROOT / name).read_text(encoding="utf-8") for page, name in OUTSIDE.items()},
-        "examples.md": "# Examples\nShort programs of `examples/`; the tests run them.\n"
-        + "".join(
-            f"\n## {file.stem}\n```python\n{file.read_text(encoding='utf-8')}```\n"
-            for file in sorted((ROOT / "examples").glob("*.py"))
-        ),
-        "command-line.md": command_line.replace("# `posekit`\n", "# Command line\n", 1),
+        "examples.md": "# Examples\nShort programs of `examples/`; the tests run them.\n" + "".join(programs),
+        "command-line.md": re.sub(r"^\*\*Commands\*\*:\n\n(\* .*\n)+", "", command_line, flags=re.MULTILINE),
     }
     for name, text in pages.items():
         files.append(File.generated(config, name, content=text))

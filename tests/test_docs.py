@@ -20,9 +20,11 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+import yaml
 from typer.main import get_command
 from typer.testing import CliRunner
 
+from posekit import __version__
 from posekit.cli.app import RENAMED, app
 from posekit.io.video import VideoWriter
 from posekit.render import Renderer
@@ -183,3 +185,10 @@ def test_site_is_built_without_a_warning(tmp_path: Path, monkeypatch: pytest.Mon
         assert not loaded, f"{page.name} loads {loaded}"
     assert "posekit estimate" in (tmp_path / "site/command-line.html").read_text()
     assert "PoseEstimator" in (tmp_path / "site/python.html").read_text()
+
+
+def test_version_is_the_same_everywhere() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["version"] == __version__
+    assert len(citation["preferred-citation"]["authors"]) == 5
+    assert f"## [{__version__}]" in (ROOT / "CHANGELOG.md").read_text()

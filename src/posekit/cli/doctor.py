@@ -84,7 +84,7 @@ def _torch() -> list[Finding]:
     if torch.version.cuda is None or torch.cuda.is_available():
         return [Finding("torch", text)]
     todo = f"In a new environment: pip install torch torchvision --index-url {CPU_INDEX}, then posekit."
-    return [Finding("torch", f"{text}; a build for NVIDIA GPUs, none is usable here: 5 GB for nothing", "note", todo)]
+    return [Finding("torch", f"{text}; a build for NVIDIA GPUs, none is usable here: 4 GB too much", "note", todo)]
 
 
 def _openvino() -> list[Finding]:
