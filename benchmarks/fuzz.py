@@ -13,6 +13,7 @@ The first input of each kind of fault is kept. An input depends on the reader, t
 from __future__ import annotations
 
 import argparse
+import copy
 import io
 import json
 import logging
@@ -150,6 +151,9 @@ def ply() -> list[Case]:
     )
     body = b"".join(struct.pack("<3f3B", *v, 10 * k, 20, 30) for k, v in enumerate(VERTICES))
     binary = head.encode() + body + b"".join(struct.pack("<B3i", 3, *face) for face in FACES)
+    mixed_head = head.replace("element face 12", "element face 8")
+    mixed = QUADS[:4] + [face for a, b, c, d in QUADS[4:] for face in ((a, b, c), (a, c, d))]
+    rows = b"".join(struct.pack(f"<B{len(face)}i", len(face), *face) for face in mixed)
     textured = _ply("float s,float t", lambda k: f"{UVS[k][0]} {UVS[k][1]}", FACES, "comment TextureFile tex.png\n")
     return [
         *_single({
@@ -158,6 +162,7 @@ def ply() -> list[Case]:
             "float.ply": _ply(colours.replace("uchar", "float"), lambda k: f"{k / 8} 0.5 1", FACES),
             "polygons.ply": _ply("", lambda _: "", QUADS),
             "binary.ply": binary,
+            "mixed.ply": mixed_head.encode() + body + rows,
         }),
         Case({"tex.ply": textured, "tex.png": _texture()}, "tex.ply", ("tex.ply", "tex.ply", "tex.png")),
     ]  # fmt: skip
@@ -354,9 +359,12 @@ def configurations() -> list[Case]:
 
 
 def weights() -> list[Case]:
+    import torch
+
     from posekit.nets.lite import LiteConfig
     from posekit.nets.weights import build, save_networks
 
+    torch.manual_seed(0)  # an input that is made again is the same
     small = LiteConfig(widths=(8, 16), blocks=1, bottleneck=8, fine=8)
     with tempfile.TemporaryDirectory() as folder:
         save_networks(Path(folder) / "lite", build("lite", small), {"trained_on": "nothing"})
@@ -572,7 +580,7 @@ def _json_changed(data: bytes, rng: random.Random) -> bytes:
         elif kind == 5:
             parent[last] = str(parent[last])
         else:
-            parent[last] = rng.choice(VALUES)
+            parent[last] = copy.deepcopy(rng.choice(VALUES))  # later changes reach into it
     return json.dumps(made).encode()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -10,9 +11,11 @@ import cv2
 import numpy as np
 
 from posekit import PoseEstimator, Renderer, estimate
+from posekit.geometry import Pose, so3_exp
 from posekit.render import render_views, view_rotations
 from posekit.synth.example import locomotive, make_example, make_film
 from posekit.tracking.tracker import Tracker
+from posekit.viewer import Photograph, PoseViewer, ViewerOptions, candidates_of
 from posekit.visualise import draw, figures
 from posekit.visualise.draw import Image
 
@@ -51,7 +54,37 @@ def views() -> Image:
     return draw.grid([view.image for view in drawn], columns=6)
 
 
-PICTURES: dict[str, Callable[[], Image]] = {"pose": pose, "track": track, "views": views}
+def page() -> Image:
+    """The page of `posekit view`: the demo's example, with the mesh moved a little off the object. Needs Chromium."""
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError:
+        sys.exit('the picture page is taken in a browser: pip install "posekit[dev]", and Chromium (docs/view.md).')
+    example = make_example(Renderer())
+    found = estimate(example.view, example.model, box=example.box)
+    shown = Photograph(example.view, "photo.png", candidates_of(found))
+    options = ViewerOptions(port=0)
+    with (
+        PoseViewer(
+            example.model, shown, save=lambda name, _: Path(name), refiner=found.estimator.refine, options=options
+        ) as viewer,
+        sync_playwright() as driver,
+    ):
+        best = found.T_cam_obj
+        viewer.move(Pose(so3_exp([0.0, 0.25, 0.1]) @ best.R, best.t + (0.03, -0.01, 0.02)))
+        flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+        browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=flags)
+        window = browser.new_page(viewport={"width": 1000, "height": 560})
+        window.goto(viewer.url)
+        window.get_by_role("button", name="Refine from here").wait_for()
+        window.wait_for_timeout(4000)  # until the scene has faded in
+        window.locator(".mantine-Notification-closeButton").first.click()  # that no GPU draws
+        window.wait_for_timeout(2000)
+        taken = cv2.imdecode(np.frombuffer(window.screenshot(), np.uint8), cv2.IMREAD_COLOR)
+    return np.ascontiguousarray(taken[..., ::-1]).astype(np.uint8)
+
+
+PICTURES: dict[str, Callable[[], Image]] = {"pose": pose, "track": track, "views": views, "page": page}
 
 
 def main(folder: Path, names: list[str]) -> None:

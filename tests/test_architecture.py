@@ -23,7 +23,7 @@ LAYERS = {
     6: {"detect", "first_pose"},
     7: {"estimate", "datasets"},
     8: {"tracking", "synth"},
-    9: {"evaluate", "train", "api"},
+    9: {"evaluate", "train", "api", "viewer"},
     10: {"cli"},
     11: {"__main__"},
 }
@@ -47,6 +47,8 @@ DOORS = {
     "pycocotools": {"detect"},
     "av": {"io"},
     "rerun": {"visualise"},
+    "viser": {"viewer"},
+    "websockets": {"viewer"},
     "openvino": {"nets", "cli"},
 }
 

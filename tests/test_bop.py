@@ -1,9 +1,12 @@
-"""BOP data sets. Accepted: pictures in rgb or gray with any suffix, folders and pictures with zeros or not, PLY, OBJ,
-GLB and STL meshes in mm, JSON with a byte order mark, no scene_gt_info, no targets or BOP'24's, a sensor's files
-(scene_camera_SENSOR.json, rgb_SENSOR; chosen as test:SENSOR where there are several). Warned about: meshes in another
-unit (by the stated diameter, or where mm make no object), a stated diameter in metres or far from the mesh's, a mesh
-so small that it may be in metres. Refused: missing or damaged files, poses in metres, entries of another kind than
-BOP's, lens distortion in scene_camera.json, scene_gt_info that does not fit scene_gt.
+"""BOP data sets.
+
+Accepted: pictures in rgb or gray with any suffix, folders and pictures with zeros or not, PLY, OBJ, GLB
+and STL meshes in mm, JSON with a byte order mark or in UTF-16, pictures with nothing in them, no scene_gt_info, no
+targets or BOP'24's, a sensor's files (scene_camera_SENSOR.json, rgb_SENSOR; chosen as test:SENSOR where there are
+several). Warned about: meshes in another unit (by the stated diameter, or where mm make no object), a stated diameter
+in metres or far from the mesh's, a mesh so small that it may be in metres. Refused: missing or damaged files, poses in
+metres, entries of another kind than BOP's, lens distortion in scene_camera.json, scene_gt_info that does not fit
+scene_gt.
 """
 
 from __future__ import annotations
@@ -179,10 +182,20 @@ def test_annotations_that_do_not_fit(root: Path) -> None:
     put(folder / "scene_gt_info.json", {"3": []})
     with pytest.raises(InputError, match=r"has 0 entries for image 3, scene_gt.json 3: they belong together"):
         BopDataset(root).instances(2, 3)
+    put(folder / "scene_gt.json", {"3": []})
+    put(folder / "scene_gt_info.json", {"3": [{}]})
+    assert BopDataset(root).instances(2, 3) == []  # nothing in the picture, whatever is said about it
     put(folder / "scene_gt.json", {"3": [{"obj_id": 5, "cam_R_m2c": [0] * 9, "cam_t_m2c": [0, 0, 900]}]})
     put(folder / "scene_gt_info.json", {"3": [{"bbox_obj": [0] * 4, "bbox_visib": [0] * 4, "visib_fract": 1}]})
     with pytest.raises(InputError, match=r"annotation 0 of image 3 .* is not BOP's"):
         BopDataset(root).instances(2, 3)
+
+
+def test_files_in_utf16_are_read(root: Path) -> None:
+    for path in (root / "test" / "000002").glob("*.json"):
+        path.write_bytes(path.read_text().encode("utf-16"))
+    data = BopDataset(root)
+    assert data.instances(2, 3) and data.view(2, 3)
 
 
 def test_a_damaged_photograph(root: Path) -> None:

@@ -1,15 +1,12 @@
 """Cameras in every spelling that is read, lens distortion, and what is refused rather than dropped.
 
-Read: fx,fy,cx,cy as text; JSON, YAML (OpenCV's, ROS's, PyYAML's), XML, plain numbers; K by rows or columns; the size as
-width and height or as a pair in either order; OpenCV's 4, 5, 8, 12, 14 and fisheye coefficients as a list, a matrix or
-one by one. Refused: another shape, skew, other models, coefficients or sizes that are no numbers. Warned of: a
-principal point far from the middle.
-
-Accepted: fx,fy,cx,cy; BOP's camera.json and scene_camera.json; JSON, YAML and XML with a matrix or four numbers under
-the names that programs use; K's numbers as text, row by row or column by column; OpenCV's 4, 5, 8, 12, 14 and fisheye
-coefficients; sizes in any spelling. Told: a camera that is scaled, lens distortion, a principal point far from the
-middle. Refused: skew, another shape of the picture, two cameras in a file, distortion that cannot be read or undone,
-files over 20 MB, YAML over 300 000 letters or 50 brackets deep.
+Accepted: fx,fy,cx,cy; BOP's camera.json and scene_camera.json; JSON, YAML (OpenCV's, ROS's, PyYAML's, ORB-SLAM's), XML,
+plain numbers; K by rows or columns, numbers as text, focal length and principal point as pairs; the size as width and
+height or as a pair in either order; OpenCV's 4, 5, 8, 12, 14 and fisheye coefficients as a list, a matrix, one by one,
+or radial and tangential ones apart; byte order marks, UTF-16. Told: a camera that is scaled, lens distortion, a
+principal point far from the middle. Refused: skew, another shape of the picture, two cameras in a file, other lens
+models (omnidirectional, division), distortion that cannot be read or undone, focal lengths that are no pixels, files
+over 20 MB, YAML over 300 000 letters or 50 brackets deep.
 """
 
 from __future__ import annotations
@@ -278,3 +275,85 @@ def test_a_number_too_large_for_a_float(tmp_path: Path) -> None:
     (tmp_path / "c.json").write_text('{"K": [%s, 0, 1, 0, 1, 1, 0, 0, 1]}' % (10**400))
     with pytest.raises(CameraError, match="holds no camera that posekit understands"):
         load_calibration(tmp_path / "c.json", (640, 480))
+
+
+# --- more spellings -----------------------------------------------------------------------------------------------
+
+OWN = [[572.4, 0.0, 325.2], [0.0, 573.5, 242.0], [0.0, 0.0, 1.0]]
+DOUBLE = [[1144.8, 0.0, 650.4], [0.0, 1147.0, 484.0], [0.0, 0.0, 1.0]]
+
+
+def written(folder: Path, data: object, name: str = "c.json") -> Path:
+    (folder / name).write_text(json.dumps(data))
+    return folder / name
+
+
+@pytest.mark.parametrize(
+    "size",
+    [
+        {"img_w": 1280, "img_h": 960}, {"image_w": 1280, "image_h": 960}, {"width_px": 1280, "height_px": 960},
+        {"cam_width": 1280, "cam_height": 960}, {"resolution_x": 1280, "resolution_y": 960}, {"wh": [1280, 960]},
+        {"ncols": 1280, "nrows": 960}, {"frame_size": [960, 1280]}, {"res": "1280x960"},
+        {"calibration_resolution": [1280, 960]}, {"Camera.width": 1280, "Camera.height": 960},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_more_spellings_of_the_size(size: dict[str, object], tmp_path: Path) -> None:
+    camera = load_calibration(written(tmp_path, {"K": DOUBLE} | size), (640, 480)).camera
+    assert (camera.fx, camera.size) == (pytest.approx(572.4), (640, 480))
+
+
+@pytest.mark.parametrize(
+    ("extra", "coefficients"),
+    [
+        ({"radial": [-0.3, 0.1], "tangential": [0.01, 0.02]}, (-0.3, 0.1, 0.01, 0.02, 0.0)),
+        ({"radial": [-0.3, 0.1, 0.05]}, (-0.3, 0.1, 0.0, 0.0, 0.05)),
+        (
+            {"radial_coeffs": [0.1, 0.02, 0.03, 0.04, 0.05, 0.06], "tangential_coeffs": [0.001, 0.002]},
+            (0.1, 0.02, 0.001, 0.002, 0.03, 0.04, 0.05, 0.06),
+        ),
+        ({"Camera.k1": -0.3, "Camera.k2": 0.1, "Camera.p1": 0.0, "Camera.p2": 0.0}, (-0.3, 0.1, 0.0, 0.0)),
+    ],
+    ids=str,
+)
+def test_more_spellings_of_distortion(
+    extra: dict[str, object], coefficients: tuple[float, ...], tmp_path: Path
+) -> None:
+    lens = load_calibration(written(tmp_path, {"intrinsics": {"K": OWN}} | extra), (640, 480)).lens
+    assert lens is not None and lens.model == "pinhole"
+    assert tuple(lens.coefficients) == pytest.approx(coefficients)
+
+
+@pytest.mark.parametrize("flag", [{"fisheye_model": 1}, {"fisheye": True}, {"camera_model": "KannalaBrandt8"}], ids=str)
+def test_more_ways_to_say_fisheye(flag: dict[str, object], tmp_path: Path) -> None:
+    lens = load_calibration(written(tmp_path, {"K": OWN, "D": [0.1, 0.01, 0.0, 0.0]} | flag), (640, 480)).lens
+    assert lens is not None and lens.model == "fisheye"
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        ({"kappa": -500.0}, "division model"),
+        ({"xi": 1.2, "D": [-0.3, 0.1, 0.0, 0.0]}, "omnidirectional or double-sphere"),
+        ({"radial": [1, 2, 3, 4]}, "3 or 6 numbers and 2 are read"),
+        ({"radial": "x"}, "cannot be read"),
+    ],
+    ids=str,
+)
+def test_lenses_that_are_not_known_are_not_dropped(extra: dict[str, object], message: str, tmp_path: Path) -> None:
+    with pytest.raises(CameraError, match=message):
+        load_calibration(written(tmp_path, {"K": OWN} | extra), (640, 480))
+    angles = {"omega": 0.1, "phi": 0.2, "kappa": 0.3}  # of where the camera is
+    assert load_calibration(written(tmp_path, {"K": OWN} | angles), (640, 480)).lens is None
+
+
+def test_focal_lengths_as_shares_or_in_mm_are_refused(tmp_path: Path) -> None:
+    for numbers in ((0.9, 1.2, 0.5, 0.5), (4.2, 4.2, 320.0, 240.0)):
+        with pytest.raises(CameraError, match="is no number of pixels for a picture of 640x480"):
+            load_calibration(written(tmp_path, dict(zip(("fx", "fy", "cx", "cy"), numbers, strict=True))), (640, 480))
+
+
+def test_focal_length_and_principal_point_as_pairs(tmp_path: Path) -> None:
+    data = {"FocalLength": [572.4, 573.5], "PrincipalPoint": [325.2, 242.0], "RadialDistortion": [-0.3, 0.1]}
+    found = load_calibration(written(tmp_path, data), (640, 480))
+    assert (found.camera.fx, found.camera.cy) == (572.4, 242.0) and found.lens is not None

@@ -1,9 +1,9 @@
 """Mask R-CNN and what surrounds it: operators, weights, training, novel objects, detections in files, commands.
 
-Detections in files. Accepted: BOP's list, COCO's map, a map by picture; boxes x, y, width, height; run lengths as text
-or numbers, polygons; numbers as text; names in any capitals. Warned about and skipped: an entry that cannot be used.
-Warned about and read: boxes that only fit as x0, y0, x1, y1. Refused: other files, and those without an entry for the
-picture, its scene or the mesh.
+Detections in files. Accepted: BOP's list or its entries one a line, COCO's map, a map by picture; boxes x, y, width,
+height; run lengths as text or numbers, polygons; numbers as text; names in any capitals. Warned about and skipped: an
+entry that cannot be used. Warned about and read: boxes that only fit as x0, y0, x1, y1. Refused: other files, and those
+without an entry for the picture, its scene or the mesh.
 """
 
 from __future__ import annotations
@@ -332,6 +332,7 @@ def found_in(folder: Path, data: object, image: str = "000001.png", name: str = 
         ({"segmentation": {"size": [60, 80], "counts": "o" * 3000}}, "neither COCO's run lengths nor polygons"),
         ({"segmentation": [[1e9, 2, 3, 1e9, 5, 6]]}, "none beyond 100000 pixels"),
         ({"bbox": [10**400, 5, 9, 9]}, "no detection"),
+        ({"bbox": [10**400, 5.5, 9.5, 9]}, "no detection"),
         ({"category_id": "six"}, "entry 2 is skipped"),
         ({"image_id": None}, "entry 2 is skipped"),
     ],
@@ -376,12 +377,20 @@ def test_run_lengths_are_coco_s() -> None:
             assert np.array_equal(decode(encode(mask), (width, height)), mask)
 
 
-def test_what_a_file_has_instead_is_said(tmp_path: Path) -> None:
+def test_what_a_file_has_instead_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with pytest.raises(PromptError, match=r"nothing for 000009.png \(image 9\); it is about the images 1, 2"):
         found_in(tmp_path, [ENTRY, ENTRY | {"image_id": 2}], "000009.png")
     with pytest.raises(PromptError, match=r"nothing for obj_000006 in this picture, only for the categories 5, 9"):
         found_in(tmp_path, [ENTRY | {"category_id": 5}, ENTRY | {"category_id": 9}])
-    assert found_in(tmp_path, []) == []
+    assert found_in(tmp_path, []) == [] and "d.json holds no detections at all" in caplog.text
+
+
+def test_one_detection_a_line_is_read(tmp_path: Path) -> None:
+    other = ENTRY | {"image_id": 2}
+    for entries in ([ENTRY], [ENTRY, other], [ENTRY, ENTRY, other]):
+        (tmp_path / "d.json").write_text("".join(json.dumps(entry) + "\r\n" for entry in entries))
+        found = DetectionsFile.read(tmp_path / "d.json", tmp_path / "000001.png")
+        assert len(found.entries) == entries.count(ENTRY)
 
 
 def test_scenes_are_respected(tmp_path: Path) -> None:

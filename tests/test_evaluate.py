@@ -1,9 +1,9 @@
 """posekit eval: scores of known estimates, malformed files, workers, interruption, results and report.
 
-Detections in files. Accepted: BOP's list, numbers as text, a byte order mark. Warned about and skipped, with the line:
-an entry that cannot be used, repeats another, is of no picture or object of the data set, or does not fit its picture.
-Warned about and read: boxes that only fit as x0, y0, x1, y1. Refused: other files, and those without an entry that can
-be used. Results in CSV. Accepted: BOP's. Refused, with the line: all else.
+Detections in files. Accepted: BOP's list, or its entries one a line; numbers as text, a byte order mark. Warned about
+and skipped, with the line: an entry that cannot be used, repeats another, is of no picture or object of the data set,
+or does not fit its picture. Warned about and read: boxes that only fit as x0, y0, x1, y1. Refused: other files, and
+those without an entry that can be used. Results in CSV. Accepted: BOP's. Refused, with the line: all else.
 """
 
 from __future__ import annotations
@@ -261,6 +261,18 @@ def test_numbers_that_are_text_are_read(root: Path, tmp_path: Path) -> None:
     assert [(r.scene, r.image, r.obj_id) for r in read_detections(path, *known(root))[2, 0]] == [(2, 0, 1)]
 
 
+def test_one_detection_a_line_is_read_and_an_empty_file_is_told(
+    root: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "detections.json"
+    path.write_text(f"{json.dumps(ENTRY)}\n\n{json.dumps(ENTRY | {'image_id': 99})}\n")
+    assert [r.line for r in read_detections(path, *known(root))[2, 0]] == [1]
+    assert f"{path}, line 3" in caplog.text and "has no image 99" in caplog.text
+    path.write_text("[]")
+    assert read_detections(path, *known(root)) == {}
+    assert f"{path} holds no detections at all" in caplog.text
+
+
 def test_many_bad_entries_are_counted_and_nothing_else_is_refused(
     root: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -304,6 +316,19 @@ def test_masks_that_are_missing_are_rendered(tmp_path: Path, root: Path) -> None
         np.testing.assert_array_equal(made.read_mask(), given.read_mask())
         assert made.visible == pytest.approx(given.visible)
         assert made.box_visib == given.box_visib and made.box_all == given.box_all
+
+
+def test_objects_without_a_mesh_are_left_out_and_told(
+    tmp_path: Path, root: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    bare = write_scene(tmp_path / "bare", images=2, masks=False)
+    rows = truth_rows(bare)
+    (bare / "models" / "obj_000002.ply").unlink()
+    assert [t.instance.obj_id for t in TruthReader(BopDataset(bare)).read(2, 0)] == [1]
+    assert "object 2 has no mesh and is left out, here and in all other pictures; there are meshes of 1" in caplog.text
+    for visible in (None, 0.1):
+        results = scored(bare, [row for row in rows if row.obj_id == 1], tmp_path, min_visible=visible)
+        assert results["counts"] == {"instances": 2, "estimates": 2, "missing": 0}
 
 
 def test_noise_is_the_instance_s_own(root: Path) -> None:

@@ -105,7 +105,8 @@ def test_troubleshooting_quotes_messages_that_exist() -> None:
 
 
 @pytest.mark.parametrize(
-    "page", ["README.md", *(f"docs/{n}.md" for n in ("quickstart", "your-object", "calibration", "troubleshooting"))]
+    "page",
+    ["README.md", *(f"docs/{n}.md" for n in ("quickstart", "your-object", "calibration", "troubleshooting", "view"))],
 )
 def test_links_and_pictures_exist(page: str) -> None:
     links = re.findall(r"\]\(([^)#]+)\)", (ROOT / page).read_text())

@@ -366,7 +366,19 @@ def test_bad_weights_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "config", ["size = [1000000000, 96]", 'size = "large"', "widths = [64]", "blocks = 3", "widths = [0, 0]"]
+    "config",
+    [
+        "size = [1000000000, 96]",
+        'size = "large"',
+        "widths = [64]",
+        "blocks = 3",
+        "widths = [0, 0]",
+        "blocks = 2147483647",
+        "heads = 2147483647",
+        "heads = 5",
+        "fine = 1.5",
+        "size = [100, 96]",
+    ],
 )
 def test_a_configuration_that_does_not_fit_its_weights_is_refused(tmp_path: Path, config: str) -> None:
     """Before anything is made of the size that it asks for."""

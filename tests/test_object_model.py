@@ -1,10 +1,12 @@
 """Meshes from files of every kind, their units, symmetries, normals, and what is refused.
 
-Accepted: PLY, OBJ, STL, GLB and glTF; polygons, concave ones too; colours of vertices, faces and materials in whatever
-numbers; textures of 8 and 16 bits in the mesh's folder, moved by KHR_texture_transform; units mm, cm, m, in. Told:
-units that were guessed, colours that are not understood, an STL with a wrong count. Refused: what is missing, empty,
-damaged, without faces, compressed, a polygon that crosses itself, vertices that are not finite or beyond 1e12, files
-named by it that are not there or lie elsewhere, more than POSEKIT_MOST_FACES or POSEKIT_MOST_MESH_BYTES.
+Accepted: PLY, OBJ, STL, GLB and glTF; polygons, concave ones and different ones in a binary PLY too; OBJ in UTF-16;
+colours of vertices, faces and materials in whatever numbers; textures of 8 and 16 bits in the mesh's folder, moved by
+KHR_texture_transform; KHR_materials_pbrSpecularGlossiness; units mm, cm, m, in. Told: units that were guessed, colours,
+textures and extensions that are not understood, transparent parts (drawn solid), an STL with a wrong count or bytes
+behind its triangles. Refused: what is missing, empty, damaged, a pointer of Git LFS or a web page, without faces,
+compressed, a polygon that crosses itself, vertices that are not finite or beyond 1e12, files named by it that are not
+there or lie elsewhere, more than POSEKIT_MOST_FACES or POSEKIT_MOST_MESH_BYTES.
 """
 
 from __future__ import annotations
@@ -12,7 +14,9 @@ from __future__ import annotations
 import json
 import logging
 import struct
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -765,6 +769,154 @@ def test_stl_that_is_cut_off(tmp_path: Path) -> None:
         ObjectModel.load(binary_stl(tmp_path / "a.stl", 20, bytes(20)))
 
 
+@pytest.mark.parametrize("told", [12, 5])
+def test_bytes_behind_the_triangles_of_an_stl(told: int, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    assert len(ObjectModel.load(binary_stl(tmp_path / "a.stl", told, bytes(7))).faces) == told
+    assert f"bytes follow its {told} triangles and are not read" in caplog.text
+
+
+def mixed_ply(path: Path, order: str, *, colours: str = "", cut: int = 0, changed: int | None = None) -> Path:
+    """A prism over an L in binary PLY: two polygons of six corners, six of four. colours: of the faces, "before" or
+    "after" their corners."""
+    corners = [(100, 10), (10, 10), (10, 80), (0, 80), (0, 0), (100, 0)]
+    polygons = [[11, 10, 9, 8, 7, 6][::-1], [5, 4, 3, 2, 1, 0]]
+    polygons += [[k, (k + 1) % 6, 6 + (k + 1) % 6, 6 + k] for k in range(6)]
+    rgb = "property uchar red\nproperty uchar green\nproperty uchar blue\n"
+    head = (
+        f"ply\nformat binary_{'little' if order == '<' else 'big'}_endian 1.0\nelement vertex 12\nproperty float x\n"
+        f"property float y\nproperty double z\nelement face 8\n{rgb if colours == 'before' else ''}"
+        f"property list uint8 uint vertex_indices\n{rgb if colours == 'after' else ''}end_header\n"
+    ).encode()
+    data = b"".join(struct.pack(order + "ffd", x, y, z) for z in (0, 12) for x, y in corners)
+    for k, polygon in enumerate(polygons):
+        row = struct.pack(f"{order}B{len(polygon)}I", len(polygon), *polygon)
+        colour = bytes((30 * k, 5, 6))
+        data += colour + row if colours == "before" else row + colour if colours == "after" else row
+    if changed is not None:  # the first polygon's number of corners
+        at = 12 * 16 + (3 if colours == "before" else 0)
+        data = data[:at] + bytes([changed]) + data[at + 1 :]
+    path.write_bytes(head + data[: len(data) - cut])
+    return path
+
+
+def surface(model: ObjectModel) -> float:
+    a, b, c = (np.asarray(model.vertices, dtype=np.float64)[model.faces[:, k]] for k in range(3))
+    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("colours", ["", "before", "after"])
+def test_polygons_of_different_sizes_in_a_binary_ply(order: str, colours: str, tmp_path: Path) -> None:
+    """As Blender writes quads and triangles together."""
+    model = ObjectModel.load(mixed_ply(tmp_path / "a.ply", order, colours=colours), units="mm")
+    assert len(model.faces) == 2 * 4 + 6 * 2
+    assert surface(model) == pytest.approx((2 * 1700 + 360 * 12) * 1e-6)  # a fan would leave the L
+    if colours:
+        assert model.colors is not None
+        assert np.unique(model.colors, axis=0).tolist() == [[30 * k, 5, 6] for k in range(8)]
+
+
+@pytest.mark.parametrize(("cut", "changed"), [(1, None), (40, None), (0, 200), (0, 0)])
+def test_a_damaged_binary_ply_of_polygons(cut: int, changed: int | None, tmp_path: Path) -> None:
+    with pytest.raises(MeshError, match=r"a.ply (cannot be read as PLY|has a face that names vertex)"):
+        ObjectModel.load(mixed_ply(tmp_path / "a.ply", "<", cut=cut, changed=changed))
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.obj", "a.stl", "a.glb"])
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\n", "git lfs pull"),
+        ("\n<!DOCTYPE html><html></html>", "holds a web page"),
+    ],
+)
+def test_files_that_hold_something_else(name: str, text: str, reason: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(MeshError, match=reason):
+        ObjectModel.load(tmp_path / name)
+
+
+def test_texts_in_utf16_are_read(tmp_path: Path) -> None:
+    corners = "".join("v {} {} {}\n".format(*corner) for corner in CORNERS)
+    faces = "".join("f {} {} {}\n".format(*(face + 1)) for face in FACES)
+    (tmp_path / "a.obj").write_bytes((corners + faces).encode("utf-16"))
+    assert len(ObjectModel.load(tmp_path / "a.obj").faces) == 12
+
+
+@pytest.mark.parametrize("names", ["Red Green Blue", "ambient_red ambient_green ambient_blue"])
+def test_more_names_of_colours(names: str, tmp_path: Path) -> None:
+    properties = "".join(f"property uchar {name}\n" for name in names.split())
+    rows = "".join("{} {} {} 9 80 200\n".format(*corner) for corner in CORNERS)
+    faces = "".join("3 {} {} {}\n".format(*face) for face in FACES)
+    (tmp_path / "a.ply").write_text(
+        f"ply\nformat ascii 1.0\nelement vertex 8\nproperty float x\nproperty float y\nproperty float z\n{properties}"
+        f"element face 12\nproperty list uchar int vertex_indices\nend_header\n{rows}{faces}"
+    )
+    colours = ObjectModel.load(tmp_path / "a.ply").colors
+    assert colours is not None and colours[0].tolist() == [9, 80, 200]
+
+
+@pytest.mark.parametrize("embedded", [True, False])
+def test_textures_are_limited(embedded: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("POSEKIT_MOST_PIXELS", "1000")
+    if embedded:
+        textured_glb(tmp_path / "a.glb", None, cv2.imencode(".png", np.zeros((40, 40, 3), np.uint8))[1].tobytes())
+    else:
+        Image.new("RGB", (40, 40)).save(tmp_path / "a.png")
+        (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd a.png\n")
+        (tmp_path / "a.obj").write_text(
+            "mtllib a.mtl\nv 0 0 0\nv 90 0 0\nv 0 90 0\nvt 0 0\nvt 1 0\nvt 1 1\nusemtl m\nf 1/1 2/2 3/3\n"
+        )
+    with pytest.raises(
+        MeshError, match=r"has a texture of 40x40 pixels, at most 0.001 megapixels .* POSEKIT_MOST_PIXELS"
+    ):
+        ObjectModel.load(next(path for path in tmp_path.iterdir() if path.suffix in (".glb", ".obj")))
+
+
+def test_texture_coordinates_that_are_no_pairs(tmp_path: Path) -> None:
+    corners = "".join("v {} {} {}\n".format(*corner) for corner in CORNERS)
+    faces = "".join("f {}/1 {}/2 {}/3\n".format(*(face + 1)) for face in FACES)
+    Image.new("RGB", (8, 8)).save(tmp_path / "a.png")
+    (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd a.png\n")
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{corners}vt 0 0\nvt 1 0\nvt 1\n1\nusemtl m\n{faces}")
+    with pytest.raises(MeshError, match="texture coordinates that are no pairs of numbers"):
+        ObjectModel.load(tmp_path / "a.obj")
+
+
+def test_colours_of_a_material_up_to_255(tmp_path: Path) -> None:
+    corners = "".join("v {} {} {}\n".format(*corner) for corner in CORNERS)
+    faces = "".join("f {} {} {}\n".format(*(face + 1)) for face in FACES)
+    (tmp_path / "a.mtl").write_text("newmtl m\nKd 200 30 0\n")
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{corners}usemtl m\n{faces}")
+    colours = ObjectModel.load(tmp_path / "a.obj").colors
+    assert colours is not None and colours[0].tolist() == [200, 30, 0]
+
+
+def test_vertex_colours_that_are_not_understood_are_not_drawn(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    corners = "".join("v {} {} {} -0.5 0.5 0.9\n".format(*corner) for corner in CORNERS)
+    faces = "".join("f {} {} {}\n".format(*(face + 1)) for face in FACES)
+    (tmp_path / "a.obj").write_text(f"#MRGB ff00ff00\n{corners}{faces}")
+    assert ObjectModel.load(tmp_path / "a.obj").colors is None
+    assert "it is drawn grey" in caplog.text and "#MRGB" in caplog.text
+
+
+@pytest.mark.parametrize(("extension", "told"), [("FOO_bar", "needs FOO_bar, which posekit does not know"),
+                                                 ("KHR_texture_basisu", "compressed with Basis")])  # fmt: skip
+def test_extensions_that_change_what_is_seen_are_told(
+    extension: str, told: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    textured_glb(tmp_path / "a.glb", None)
+    data = (tmp_path / "a.glb").read_bytes()
+    length = int.from_bytes(data[12:16], "little")
+    document = json.loads(data[20 : 20 + length]) | {"extensionsRequired": [extension], "extensionsUsed": [extension]}
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sIII", b"glTF", 2, len(data) - length + len(text), len(text)) + b"JSON"
+    (tmp_path / "a.glb").write_bytes(head + text + data[20 + length :])
+    assert len(ObjectModel.load(tmp_path / "a.glb").faces)
+    assert told in caplog.text
+
+
 @pytest.mark.parametrize(("extension", "name"), [("KHR_draco_mesh_compression", "Draco"),
                                                  ("EXT_meshopt_compression", "meshopt")])  # fmt: skip
 def test_compressed_geometry_is_named(extension: str, name: str, tmp_path: Path) -> None:
@@ -789,8 +941,13 @@ def test_the_note_on_units_says_the_size(tmp_path: Path, caplog: pytest.LogCaptu
     assert "the object is 27 mm long" in caplog.text and "; in cm it is 27 cm long" in caplog.text
 
 
-def textured_glb(path: Path, moved: dict[str, object] | None, picture: bytes | None = None) -> None:
-    """A quad from trimesh, its colour texture moved, or replaced by another PNG."""
+def textured_glb(
+    path: Path,
+    moved: dict[str, object] | None,
+    picture: bytes | None = None,
+    material: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
+) -> None:
+    """A quad from trimesh, its colour texture moved, or replaced by another PNG. material: makes another of it."""
     scene = trimesh.Scene()
     scene.add_geometry(quad(plain_picture((200, 0, 0)), 0.0), geom_name="a")
     data = scene.export(file_type="glb")
@@ -800,6 +957,8 @@ def textured_glb(path: Path, moved: dict[str, object] | None, picture: bytes | N
         texture = document["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
         texture["extensions"] = {"KHR_texture_transform": moved}
         document["extensionsUsed"] = ["KHR_texture_transform"]
+    if material is not None:
+        document["materials"] = [material(document["materials"][0])]
     if picture is not None:
         start = len(buffer) + -len(buffer) % 4
         buffer = buffer.ljust(start, b"\0") + picture
@@ -836,6 +995,35 @@ def test_an_embedded_texture_of_twelve_bits_in_sixteen(tmp_path: Path, caplog: p
     texture = ObjectModel.load(tmp_path / "a.glb").texture
     assert texture is not None and texture[0, 0].tolist() == [255, 128, 0]
     assert "they are taken for 12 bits" in caplog.text
+
+
+@pytest.mark.parametrize("plain", [{}, {"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1]}}])
+def test_colours_of_specular_glossiness(tmp_path: Path, plain: dict[str, Any]) -> None:
+    def textured(material: dict[str, Any]) -> dict[str, Any]:
+        old = {"diffuseTexture": material["pbrMetallicRoughness"]["baseColorTexture"]}
+        return plain | {"extensions": {"KHR_materials_pbrSpecularGlossiness": old}}
+
+    def coloured(_: dict[str, Any]) -> dict[str, Any]:
+        return {"extensions": {"KHR_materials_pbrSpecularGlossiness": {"diffuseFactor": [0.0, 1.0, 0.0, 1.0]}}}
+
+    textured_glb(tmp_path / "a.glb", None, material=textured)
+    texture = ObjectModel.load(tmp_path / "a.glb").texture
+    assert texture is not None and texture[0, 0].tolist() == [200, 0, 0]  # it was white
+    textured_glb(tmp_path / "b.glb", None, material=coloured)
+    model = ObjectModel.load(tmp_path / "b.glb")
+    colours = model.colors if model.texture is None else model.texture.reshape(-1, 3)
+    assert colours is not None and colours[0].tolist() == [0, 255, 0]
+
+
+@pytest.mark.parametrize(("mode", "alpha", "told"), [("MASK", 0, True), ("MASK", 255, False), ("OPAQUE", 0, False)])
+def test_transparent_parts_are_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, mode: str, alpha: int, told: bool
+) -> None:
+    pixels = np.full((8, 8, 4), (0, 128, 255, 255), np.uint8)
+    pixels[:4, :, 3] = alpha
+    textured_glb(tmp_path / "a.glb", None, cv2.imencode(".png", pixels)[1].tobytes(), lambda m: m | {"alphaMode": mode})
+    assert ObjectModel.load(tmp_path / "a.glb").texture is not None
+    assert ("are transparent; they are drawn solid" in caplog.text) == told
 
 
 def test_limits_of_meshes_can_be_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -113,7 +113,5 @@ def test_setup_says_that_python_is_too_old(tree: Path, tmp_path: Path) -> None:
 def test_constraints_lie_within_the_ranges() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     pinned = [line for line in (ROOT / "scripts/constraints.txt").read_text().splitlines() if "==" in line]
-    names = {line.split("==")[0] for line in pinned}
-    assert {"torch", "torchvision"} < names
-    assert all(name.startswith(("torch", "mkdocs")) for name in names)
+    assert {line.split("==")[0] for line in pinned} >= {"torch", "torchvision", "viser", "mkdocs-material"}
     assert not any("==" in dependency for dependency in project["dependencies"])

@@ -1,8 +1,9 @@
 """The trainer: a step teaches, a killed training ends as one that was not, two processes do as one, nothing is lost.
 
 Configurations. Accepted: TOML of TrainConfig's shape, whatever it leaves out as the recipe has it; whole numbers for
-fractions. Refused: what is missing or no TOML, an unknown key (the nearest one is named) or recipe, a value of another
-kind, a list of another length, numbers out of range. There are no warnings.
+fractions; a byte order mark. Refused: what is missing or no TOML, an unknown key (the nearest one is named) or recipe,
+a value of another kind, a list of another length, numbers that are out of range, not finite or negative. There are no
+warnings.
 """
 
 from __future__ import annotations
@@ -16,14 +17,20 @@ import resource
 import signal
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Iterator
+import tomllib
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from safetensors.torch import save_file
 from typer.testing import CliRunner
 
@@ -489,6 +496,15 @@ def test_a_configuration_is_what_its_file_says(tmp_path: Path) -> None:
         ("[optimiser]\nrate = -1.0", "positive"),
         ("[stream]\nshard = 8\nmvnet = 3", "multiple of the batch's 4 shards"),
         ("a = [", "no readable TOML"),
+        ("[optimiser]\nrate = nan", "optimiser.rate is nan: numbers are finite"),
+        ("[stream.pairs]\ndistance = [3.0, inf]", "stream.pairs.distance is .*: numbers are finite"),
+        ("[stream.augment]\nclutter = -1", "stream.augment.clutter is -1: numbers are finite and not negative"),
+        ("seed = -1", "seed is -1"),
+        ("[lite]\nblocks = 1000000000", "lite: its numbers are from 1 to 4096, blocks at most 64"),
+        ("[lite]\nsize = [100, 96]", "multiples of 8 pixels"),
+        ("[lite]\nheads = 5", "heads 5 divide"),
+        ("[paper]\nwidth = 0", "width is above 0"),
+        ("[paper]\nviews = 0", "views are whole numbers from 1"),
     ],
 )
 def test_a_wrong_configuration_is_refused(tmp_path: Path, text: str, message: str) -> None:
@@ -496,6 +512,53 @@ def test_a_wrong_configuration_is_refused(tmp_path: Path, text: str, message: st
     file.write_text(text)
     with pytest.raises(ConfigError, match=message):
         read_config(file)
+
+
+def test_a_configuration_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+    (tmp_path / "a.toml").write_bytes(b"\xef\xbb\xbfsteps = 7\r\n")
+    assert read_config(tmp_path / "a.toml").steps == 7
+
+
+ODD = st.one_of(
+    st.integers(), st.floats(), st.booleans(), st.text(max_size=8), st.lists(st.integers(-3, 300), max_size=3),
+    st.lists(st.floats(), min_size=2, max_size=2), st.dictionaries(st.text(max_size=5), st.integers(), max_size=2),
+)  # fmt: skip
+
+
+def places(table: Mapping[str, Any], way: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    for key, value in table.items():
+        yield (*way, key)
+        if isinstance(value, Mapping):
+            yield from places(value, (*way, key))
+
+
+@settings(max_examples=80, deadline=None)
+@given(st.data())
+def test_any_value_in_a_configuration_is_taken_or_refused(data: st.DataObject) -> None:
+    """What is taken is written and read as it is."""
+    values = tomllib.loads(write_config(default_config(data.draw(st.sampled_from(("lite", "paper"))))))
+    for *way, last in data.draw(st.lists(st.sampled_from(list(places(values))), max_size=3, unique=True)):
+        table: Any = values
+        for key in way:
+            table = table.get(key, {}) if isinstance(table, dict) else {}
+        if isinstance(table, dict):
+            table[data.draw(st.just(last) | st.text(max_size=5))] = data.draw(ODD)
+    try:
+        config = changed(default_config("lite"), values, "here")
+    except ConfigError:
+        return
+    assert changed(default_config("lite"), tomllib.loads(write_config(config)), "here") == config
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.binary(max_size=60), st.integers(0, 10**4), st.integers(0, 60))
+def test_any_bytes_in_a_configuration_are_taken_or_refused(new: bytes, start: int, length: int) -> None:
+    text = write_config(default_config("lite")).encode()
+    start %= len(text)
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "a.toml").write_bytes(text[:start] + new + text[start + length :])
+        with suppress(ConfigError):
+            read_config(Path(folder) / "a.toml")
 
 
 def test_options_override_a_configuration() -> None:

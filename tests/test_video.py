@@ -1,7 +1,7 @@
 """Frames in and out: what can be read is, and the rest is told.
 
-Accepted: videos that FFmpeg decodes, turned upright as players do, with titles in any letters; folders and globs of
-pictures, in the order of the numbers in their names; a BOP scene or a sensor's scene_camera_SENSOR.json; a camera's
+Accepted: videos that FFmpeg decodes, turned and mirrored as players do, with titles in any letters; folders and globs
+of pictures, in the order of the numbers in their names; a BOP scene or a sensor's scene_camera_SENSOR.json; a camera's
 number; a camera for each picture, EXIF data, lens distortion. Told frame by frame: what cannot be decoded, a damaged
 picture, a size of another shape; a truncated video ends early. Warned of: a camera that is not known. Refused: what is
 not there or is no video, a video without pictures in it, a folder without pictures, several sensors, frames to be
@@ -14,6 +14,7 @@ import json
 import struct
 import threading
 import time
+from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 
@@ -148,6 +149,7 @@ def test_folders_and_globs_in_the_order_of_names(tmp_path: Path) -> None:
     for k in (2, 0, 1):
         cv2.imwrite(str(tmp_path / f"{k}.png"), picture(k))
     (tmp_path / "notes.txt").write_text("no picture")
+    (tmp_path / "._1.png").write_bytes(b"\0\5\x16\7")  # as macOS leaves on other disks
     (tmp_path / "1b.png").write_bytes(b"damaged")
     for source in (str(tmp_path), str(tmp_path / "*.png")):
         read = list(open_frames(source))
@@ -155,9 +157,12 @@ def test_folders_and_globs_in_the_order_of_names(tmp_path: Path) -> None:
         assert "1b.png" in read[2].problem
 
 
-def matrix_written(path: Path, degrees: int) -> Path:
-    """The video's display matrix set to a turn clockwise, as phones write it."""
-    a, b, c, d = {0: (1, 0, 0, 1), 90: (0, 1, -1, 0), 180: (-1, 0, 0, -1), 270: (0, -1, 1, 0)}[degrees]
+TURNS = {0: (1, 0, 0, 1), 90: (0, 1, -1, 0), 180: (-1, 0, 0, -1), 270: (0, -1, 1, 0)}
+
+
+def matrix_written(path: Path, matrix: tuple[int, int, int, int]) -> Path:
+    """The video's display matrix, as phones write it."""
+    a, b, c, d = matrix
     data = bytearray(path.read_bytes())
     start = data.find(b"tkhd") + 4 + 4 + 4 * 5 + 8 + 8
     values = [a << 16, b << 16, 0, c << 16, d << 16, 0, 0, 0, 0x40000000]
@@ -173,11 +178,32 @@ def test_frames_are_turned_as_players_do(degrees: int, tmp_path: Path) -> None:
     with VideoWriter(tmp_path / "a.mp4", 30.0) as writer:
         for _ in range(4):
             writer.write(np.ascontiguousarray(np.rot90(upright, degrees // 90)))  # turned back clockwise
-    frames = list(open_frames(str(matrix_written(tmp_path / "a.mp4", degrees)), "100,100,48,32"))
+    frames = list(open_frames(str(matrix_written(tmp_path / "a.mp4", TURNS[degrees])), "100,100,48,32"))
     assert len(frames) == 4
     for frame in frames:
         assert frame.image is not None, frame.problem
         assert np.abs(frame.image.astype(int) - upright).mean() < 4
+
+
+@pytest.mark.parametrize(
+    ("matrix", "stored"),
+    [
+        ((-1, 0, 0, 1), lambda image: image[:, ::-1]),
+        ((1, 0, 0, -1), lambda image: image[::-1]),
+        ((0, 1, 1, 0), lambda image: image.swapaxes(0, 1)),
+        ((0, -1, -1, 0), lambda image: image[::-1, ::-1].swapaxes(0, 1)),
+    ],
+)
+def test_mirrored_frames_are_shown_as_players_do(
+    matrix: tuple[int, int, int, int], stored: Callable[[np.ndarray], np.ndarray], tmp_path: Path
+) -> None:
+    upright = picture(3)
+    upright[:20, :20] = 0
+    with VideoWriter(tmp_path / "a.mp4", 30.0) as writer:
+        for _ in range(2):
+            writer.write(np.ascontiguousarray(stored(upright)))
+    [frame, _] = open_frames(str(matrix_written(tmp_path / "a.mp4", matrix)), "100,100,48,32")
+    assert frame.image is not None and np.abs(frame.image.astype(int) - upright).mean() < 4
 
 
 def test_numbers_in_names_count_as_numbers(tmp_path: Path) -> None:

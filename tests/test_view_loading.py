@@ -1,11 +1,13 @@
 """Photographs, masks, boxes and poses from files, and every way in which they are refused.
 
 Photographs. Accepted: PNG, JPEG, TIFF, BMP, WebP, GIF's first picture, grey, palette, CMYK, transparent, 8 and 16 bits,
-turned by EXIF. Warned about: 10 and 12 bits in a file of 16, damaged EXIF data, a baseline JPEG that lacks a few of its
-last rows, a camera that nobody knows. Refused: what is missing, empty, no picture, damaged, cut off further up, of
-floating-point numbers, under 16 pixels a side or over POSEKIT_MOST_PIXELS.
+turned by EXIF. Warned about: 10 and 12 bits in a file of 16 (a few hot pixels aside), a TIFF of several pictures,
+damaged EXIF data or a second header of them (not turned), a baseline JPEG that lacks a few of its last rows, a camera
+that nobody knows. Refused: what is missing, empty, no picture (HEIC, raw files, pointers of Git LFS and web pages are
+named), damaged, cut off further up, of floating-point numbers, under 16 pixels a side or over POSEKIT_MOST_PIXELS.
 Masks. Accepted: any picture, white where the object is, brighter than half. Warned about: values in between, what looks
-inverted. Refused: labels, another size than the photograph's, nothing in it.
+inverted. Refused: labels (small numbers, or areas of several values or colours), another size than the photograph's,
+nothing in it.
 Poses. Accepted: T_cam_obj in metres or its 4x4 numbers alone, a result.json, BOP's pair in mm. Refused: all else.
 """
 
@@ -248,6 +250,70 @@ def test_damaged_exif_does_not_stop_a_picture(tmp_path: Path, entries: list[byte
     exif = b"II*\0\x08\0\0\0" + struct.pack("<H", len(entries)) + b"".join(entries) + b"\0\0\0\0" + tail
     assert load_image(jpeg(tmp_path / "a.jpg", exif)).shape == ((64, 48, 3) if turned else (48, 64, 3))
     assert load_view(tmp_path / "a.jpg").camera.size == ((48, 64) if turned else (64, 48))
+
+
+def test_a_few_hot_pixels_do_not_make_a_picture_dark(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    values = np.full((200, 200, 3), (1000, 2000, 4095), np.uint16)  # OpenCV's order, 12 bits
+    values[5, 5] = 65535
+    cv2.imwrite(str(tmp_path / "a.png"), values)
+    found = load_image(tmp_path / "a.png")
+    assert found[0, 0].tolist() == [255, 125, 62] and found[5, 5].tolist() == [255, 255, 255]
+    assert "all but a few of its 16-bit pixels go up to 4095 only, so they are taken for 12 bits" in caplog.text
+
+
+def test_twelve_bits_in_jpeg_2000(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    if not cv2.imwrite(str(tmp_path / "a.jp2"), np.full((64, 64, 3), (1000, 2000, 4080), np.uint16)):
+        pytest.skip("OpenCV is built without JPEG 2000")
+    assert np.abs(load_image(tmp_path / "a.jp2")[9, 9].astype(int) - (254, 125, 62)).max() <= 2
+    assert "taken for 12 bits" in caplog.text
+
+
+def test_a_tiff_of_several_pictures_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    small = Image.new("RGB", (20, 16), (9, 8, 7))
+    small.save(tmp_path / "a.tif", save_all=True, append_images=[Image.new("RGB", (64, 48))])
+    assert load_image(tmp_path / "a.tif")[0, 0].tolist() == [9, 8, 7]
+    assert "a.tif holds 2 pictures: the first one, 20x16 pixels, is read" in caplog.text
+
+
+def test_masks_of_several_objects_are_refused(tmp_path: Path) -> None:
+    two = np.zeros((48, 64, 3), np.uint8)
+    two[5:20, 5:20], two[25:40, 25:40] = (200, 0, 0), (0, 180, 0)
+    Image.fromarray(two).save(tmp_path / "a.png")
+    with pytest.raises(PromptError, match=r"areas of #00b400 and #c80000, as a picture of labels"):
+        load_mask(tmp_path / "a.png")
+    Image.fromarray(two.max(axis=2)).save(tmp_path / "a.png")
+    with pytest.raises(PromptError, match="areas of 180 and 200, as a picture of labels"):
+        load_mask(tmp_path / "a.png")
+    two[25:40, 25:40] = 0
+    Image.fromarray(two).save(tmp_path / "a.png")
+    assert load_mask(tmp_path / "a.png").sum() == 225  # one colour is one object
+    noise = np.random.default_rng(0).integers(0, 40, (48, 64))
+    Image.fromarray((two.max(axis=2) // 200 * 160 + noise).astype(np.uint8)).save(tmp_path / "a.png")
+    assert load_mask(tmp_path / "a.png").sum() == 225
+
+
+def test_an_orientation_behind_a_second_header_is_none(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0" + ORIENTATION + b"\0\0\0\0"
+    assert load_image(jpeg(tmp_path / "a.jpg", exif)).shape == (48, 64, 3)  # as viewers and OpenCV show it
+    assert "a second header" in caplog.text
+
+
+def test_a_picture_that_is_a_pointer_of_git_lfs(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
+    with pytest.raises(ImageError, match=r"the picture .*a.png holds a pointer of Git LFS .* git lfs pull"):
+        load_image(tmp_path / "a.png")
+
+
+def test_a_pose_in_utf16_is_read(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_bytes(json.dumps({"T_cam_obj": np.eye(4).tolist()}).encode("utf-16"))
+    assert load_pose(tmp_path / "a.json").t.tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize(("name", "way_out"), [("a.HEIC", "export it as JPEG"), ("a.dng", "developed first")])
+def test_files_of_phones_and_cameras_that_are_not_read(tmp_path: Path, name: str, way_out: str) -> None:
+    (tmp_path / name).write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + bytes(400))
+    with pytest.raises(ImageError, match=way_out):
+        load_image(tmp_path / name)
 
 
 @pytest.mark.parametrize(

@@ -32,6 +32,7 @@ from posekit.cli import (
     synth,
     track,
     train,
+    view,
 )
 from posekit.errors import PosekitError
 
@@ -155,6 +156,7 @@ app.command("estimate")(estimate.estimate)
 app.command("detect")(detect.detect)
 app.command("refine")(refine.refine)
 app.command("track")(track.track)
+app.command("view")(view.view)
 app.command("render-views")(render_views.render_views)
 app.command("synth")(synth.synth)
 app.add_typer(train.train, name="train")

@@ -22,6 +22,7 @@ from posekit.camera import Box, Camera
 from posekit.errors import CameraError, ImageError, InputError, MeshError
 from posekit.geometry import Pose
 from posekit.io.calibration import calibration_of_entry
+from posekit.io.files import read_text
 from posekit.io.load import load_image, load_mask, pose_from_bop
 from posekit.mesh.model import ObjectModel
 from posekit.mesh.units import UNITS
@@ -249,6 +250,8 @@ class BopDataset:
         if image not in here.truths:
             raise InputError(f"{here.file('scene_gt')} has no annotations for image {image}.")
         truths = here.truths[image]
+        if not truths:
+            return []
         infos = here.infos.get(image, []) if here.infos is not None else [None] * len(truths)
         if len(infos) != len(truths):
             raise InputError(
@@ -461,7 +464,7 @@ def _mesh(path: Path, stated: float | None) -> ObjectModel:
 
 def _json(path: Path) -> Any:
     try:
-        return json.loads(path.read_text(encoding="utf-8-sig"))
+        return json.loads(read_text(path))
     except FileNotFoundError as error:
         raise InputError(f"there is no file {path}: this copy of the data set is not complete.") from error
     except (OSError, ValueError, RecursionError) as error:

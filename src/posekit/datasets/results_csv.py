@@ -18,8 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from posekit.camera import Box
+from posekit.detect.external import json_lines
 from posekit.detect.segmentation import decode
 from posekit.errors import InputError
+from posekit.io.files import read_text
 
 COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 _LOOSE = 0.01  # how far R R^T may be from the identity: files are rounded
@@ -234,6 +236,8 @@ class _Skipped:
         """used: entries that are left. Raises InputError where there are none but skipped ones."""
         if self.count > _TOLD:
             log.warning("%s: %d entries in all are skipped, %d are used.", self.path, self.count, used)
+        if not self.count and not used:
+            log.warning("%s holds no detections at all.", self.path)
         if self.count and not used:
             raise InputError(f"{self.path} has {self.count} entries and none that can be used; {self.first}.")
 
@@ -313,8 +317,13 @@ def _is_rle(rle: Any) -> bool:
 
 
 def _entries(path: Path) -> Iterator[tuple[int, Any]]:
-    """The entries of a JSON list, each with the line that it starts in."""
+    """The entries of a JSON list or of JSON Lines, each with the line that it starts in."""
     text = _text(path)
+    lines = json_lines(text)
+    if lines is not None:
+        numbers = [k + 1 for k, line in enumerate(text.split("\n")) if line.strip()]
+        yield from zip(numbers, lines, strict=True)
+        return
     decoder = json.JSONDecoder()
     at, line, counted = _skip(text, 0), 1, 0
     if not text[at : at + 1] == "[":
@@ -350,7 +359,7 @@ def _skip(text: str, at: int) -> int:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8-sig")
+        return read_text(path)
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise InputError(f"{path} cannot be read: {reason}. Check the path.") from error

@@ -15,6 +15,7 @@ from posekit.camera import Box, mask_box
 from posekit.detect.prompts import clip_box
 from posekit.detect.segmentation import decode, encode, xywh
 from posekit.errors import PromptError
+from posekit.io.files import read_text
 from posekit.mesh.model import ObjectModel
 from posekit.results import Detection, Source
 from posekit.view import View
@@ -25,7 +26,7 @@ _BEYOND = 1.1  # of a picture's side: a box that ends further out is no width an
 
 _FORMS = (
     "a list of {image_id, category_id, score, bbox: [x, y, width, height], segmentation} as BOP and COCO results have "
-    "it, or COCO's {images, annotations, categories}"
+    "it, one of them a line, or COCO's {images, annotations, categories}"
 )
 
 
@@ -46,7 +47,8 @@ class DetectionsFile:
         none for this picture, and says which pictures it has.
         """
         try:
-            data = json.loads(path.read_text(encoding="utf-8-sig"))
+            text = read_text(path)
+            data = json_lines(text) or json.loads(text)
         except (OSError, ValueError, RecursionError) as error:
             raise PromptError(f"the detections {path} cannot be read ({error}): give {_FORMS}.") from error
         try:
@@ -56,6 +58,8 @@ class DetectionsFile:
             raise PromptError(f"{path} holds no detections ({error!r}): give {_FORMS}.") from error
         if every and not entries:
             raise PromptError(f"{path} has {len(every)} entries and none that can be used: give {_FORMS}.")
+        if not every:
+            log.warning("%s holds no detections at all.", path.name)
         return cls(_of_picture(_of_scene(entries, image, path.name), image, files, path.name), names, path.name)
 
     def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
@@ -124,6 +128,18 @@ class DetectionsFile:
             box = view.lens.undistorted_box(clip_box(box, taken))
             mask = None if mask is None else view.lens.undistorted_mask(mask)
         return Detection(clip_box(box, view.camera), mask, score, model.name, Source.FILE)
+
+
+def json_lines(text: str) -> list[Any] | None:
+    """The entries of a file that has one detection a line (JSON Lines); None where it has another form."""
+    lines = [line for line in text.split("\n") if line.strip()]
+    if not lines or not all(line.lstrip().startswith("{") for line in lines):
+        return None
+    try:
+        found = [json.loads(line) for line in lines]
+    except ValueError:
+        return None
+    return found if all("category_id" in entry for entry in found) else None
 
 
 def _parts(data: Any) -> tuple[list[Any], dict[int, str], dict[int, str]]:
@@ -212,7 +228,10 @@ def are_corners(boxes: Sequence[Sequence[float]], size: tuple[int, int], label: 
 
 
 def _four(values: Any) -> bool:
-    return isinstance(values, list) and len(values) == 4 and all(type(v) in (int, float) for v in values)
+    """Whether these are a box's four numbers: whole numbers of any length can be in JSON, and no pixel is that far."""
+    return (
+        isinstance(values, list) and len(values) == 4 and all(type(v) in (int, float) and abs(v) < 1e9 for v in values)
+    )
 
 
 def _box(values: Sequence[float], corners: bool) -> Box:

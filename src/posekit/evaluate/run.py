@@ -184,7 +184,7 @@ def _from_csv(
     reader, cases = TruthReader(data), []
     rank_by_visibility = options.min_visible is not None
     for scene, image in wanted:
-        instances = data.instances(scene, image, every=True)
+        instances = reader.instances(scene, image)
         if rank_by_visibility:
             truths = reader.read(scene, image, masks=False)
             chosen = {t.instance.index for t in selected(data, truths, scene, image, options)}

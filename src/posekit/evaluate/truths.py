@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -13,6 +14,8 @@ from posekit.datasets.bop import Instance
 from posekit.datasets.registry import Dataset
 from posekit.evaluate.options import EvalOptions
 from posekit.render import Renderer
+
+log = logging.getLogger("posekit")
 
 Mask = NDArray[np.bool_]
 
@@ -36,11 +39,24 @@ class TruthReader:
     def __init__(self, data: Dataset, make_renderer: Callable[[], Renderer] = Renderer) -> None:
         self.data, self._make = data, make_renderer
         self._renderer: Renderer | None = None
+        self._told: set[int] = set()
+
+    def instances(self, scene: int, image: int) -> list[Instance]:
+        """All annotated instances of a picture whose objects have a mesh; the others are told, once for an object."""
+        found, meshes = self.data.instances(scene, image, every=True), self.data.model_ids()
+        for obj_id in sorted({i.obj_id for i in found} - {*meshes} - self._told):
+            self._told.add(obj_id)
+            log.warning(
+                "scene %d, image %d: object %d has no mesh and is left out, here and in all other pictures; there are "
+                "meshes of %s.",
+                scene, image, obj_id, ", ".join(map(str, meshes)),
+            )  # fmt: skip
+        return [i for i in found if i.obj_id in meshes]
 
     def read(self, scene: int, image: int, masks: bool = True) -> list[Truth]:
-        """All annotated instances of a picture. masks: whether masks will be asked for; without, and where the boxes
-        and visible shares are known, nothing is rendered."""
-        instances = self.data.instances(scene, image, every=True)
+        """All annotated instances of a picture whose objects have a mesh. masks: whether masks will be asked for;
+        without, and where the boxes and visible shares are known, nothing is rendered."""
+        instances = self.instances(scene, image)
         known = all(np.isfinite(i.visib_fract) for i in instances)
         there = all(i.mask_path.is_file() for i in instances)
         if known and (there or not masks):

@@ -32,6 +32,7 @@ FORMS = (
 MOST_BYTES = 20_000_000  # a scene_camera.json of 100 000 pictures is smaller
 _MOST_NUMBERS = 1000
 _MOST_YAML, _DEEPEST = 300_000, 50  # letters and brackets: its parser takes seconds for more
+_SHORTEST = 0.02  # of a side: a focal length for a field of view of 175 degrees
 _FAR = 0.12  # of a side, from the middle to the principal point
 
 # Keys are compared in lower case, without anything but letters and digits.
@@ -40,18 +41,32 @@ _MATRICES = ("cameramatrix", "camk", "k", "intrinsicmatrix", "intrinsics", "intr
 _FOCAL = (("fx", "flx", "focalx", "focallengthx", "fu"), ("fy", "fly", "focaly", "focallengthy", "fv"))
 _POINT = (("cx", "ppx", "principalx", "principalpointx", "u0", "cu"),
           ("cy", "ppy", "principaly", "principalpointy", "v0", "cv"))  # fmt: skip
-_WIDTHS = ("width", "imagewidth", "imgwidth", "w", "imwidth", "framewidth", "colorwidth", "resx", "xres", "cols")
-_HEIGHTS = ("height", "imageheight", "imgheight", "h", "imheight", "frameheight", "colorheight", "resy", "yres", "rows")
+_PAIRS = (("focallength", "focallengths", "focal", "fc"), ("principalpoint", "opticalcenter", "cc"))  # MATLAB
+_WHAT = "(image|img|im|frame|color|colour|rgb|photo|picture|video|capture|camera|cam|stream)"
+_WIDTHS = re.compile(
+    rf"{_WHAT}?(w|width)(px|pixels|inpixels)?|(res|size|resolution|imagesize|n)(x|w|width|cols)|xres|xresolution|cols|columns"
+)
+_HEIGHTS = re.compile(
+    rf"{_WHAT}?(h|height)(px|pixels|inpixels)?|(res|size|resolution|imagesize|n)(y|h|height|rows)|yres|yresolution|rows"
+)
 _SIZES = ("resolution", "imagesize", "imgsize", "size", "imagesizes", "imageresolution", "imageshape", "imgshape",
-          "shape", "dims", "imagedims", "imagedimensions", "sensorresolution", "calibrationimagesize")  # fmt: skip
+          "shape", "dims", "imagedims", "imagedimensions", "sensorresolution", "calibrationimagesize", "wh", "hw",
+          "imagewh", "imagehw", "imgwh", "imghw", "imwh", "imhw", "widthheight", "framesize", "videosize", "imsize",
+          "picturesize", "photosize", "capturesize", "colorresolution", "rgbresolution", "cameraresolution", "res",
+          "imgresolution", "imres", "sizewh", "sizehw", "dimensions", "imgshape", "imshape")  # fmt: skip
 _MODELS = ("distortionmodel", "cameramodel", "model", "distortiontype", "cameratype", "lensmodel", "projection",
            "cammodel")  # fmt: skip
 _PINHOLE = ("pinhole", "perspective", "opencv", "fullopencv", "plumbbob", "radtan", "radialtangential", "radtan5",
             "rationalpolynomial", "rational", "brownconrady", "brown", "simplepinhole", "none", "pinholeradtan",
             "frame", "thinprism", "linear", "standard", "")  # fmt: skip
 _FISHEYE = ("fisheye", "equidistant", "equi", "kannalabrandt", "kannalabrandt4", "kb4", "opencvfisheye", "kb",
-            "pinholeequi", "pinholeequidistant", "fisheyeopencv")  # fmt: skip
+            "kannalabrandt8", "pinholeequi", "pinholeequidistant", "fisheyeopencv")  # fmt: skip
 _COEFFICIENT = re.compile(r"(k[1-6]|p[12]|s[1-4]|tau[xy])")
+_ONE_BY_ONE = r"([fc][xy]|k[1-6]|p[12]|width|height)"
+_PARTS = tuple(
+    re.compile(rf"{kind}(distortions?|dist|coef|coefs|coeffs?|coefficients?)?") for kind in ("radial", "tangential")
+)
+_OTHER_LENSES = {"xi": "the omnidirectional or double-sphere model", "kappa": "the division model"}
 _DISTORTION = re.compile(r"d|.*(distort|dist(?!an)|coef|lens).*")
 
 
@@ -246,7 +261,7 @@ def _flat(data: Mapping[Any, Any]) -> dict[str, Any]:
 
 def _items(data: Mapping[Any, Any], depth: int = 0) -> Iterator[tuple[str, Any]]:
     for name, value in data.items():
-        key = _key(name)
+        key = re.sub(rf"^(camera|cam)\d?(?={_ONE_BY_ONE}$)", "", _key(name))  # ORB-SLAM's Camera.fx
         if not isinstance(value, Mapping):
             yield key, value
         elif any(_key(inner) == "data" for inner in value):
@@ -283,6 +298,9 @@ def _pinhole(flat: Mapping[str, Any], size: Size) -> Camera:
     spelled = [next((flat[name] for name in names if name in flat), None) for names in (*_FOCAL, *_POINT)]
     if all(value is not None for value in spelled):
         return _camera([float(value) for value in spelled if value is not None], size)
+    pairs = [next((flat[name] for name in names if name in flat), None) for names in _PAIRS]
+    if all(isinstance(pair, list) and len(pair) == 2 for pair in pairs):
+        return _camera([float(value) for pair in pairs if pair is not None for value in pair], size)
     for name in _MATRICES:
         if name in flat:
             if len(numbers := _numbers(flat[name])) == 4 and name != "k":
@@ -312,13 +330,17 @@ def _from_matrix(numbers: Any, size: Size) -> Camera:
 
 def _size(flat: Mapping[str, Any], camera: Camera) -> Size | None:
     """The picture size that the file is for, (width, height); None where it gives none."""
-    width, height = (next((flat[name] for name in names if flat.get(name)), None) for names in (_WIDTHS, _HEIGHTS))
+    width, height = (
+        next((flat[name] for name in flat if names.fullmatch(name) and flat[name]), None)
+        for names in (_WIDTHS, _HEIGHTS)
+    )
     if width is not None and height is not None:
         pair = [float(width), float(height)]
         return _whole(pair, "width and height")
     if width is not None or height is not None:
         raise CameraError("it gives a width or a height of the picture, not both: add the other one.")
-    for name in _SIZES:
+    others = [name for name in flat if re.fullmatch(r".*(resolution|imagesize|imgsize|imageshape)", name)]
+    for name in dict.fromkeys((*_SIZES, *others)):
         if flat.get(name) is None:
             continue
         values = _numbers(flat[name])
@@ -342,7 +364,14 @@ def _whole(values: list[float], name: str) -> Size:
 
 def _distortion(flat: Mapping[str, Any]) -> tuple[tuple[float, ...], str]:
     """Coefficients in OpenCV's order, none where all are 0, and "pinhole" or "fisheye". Raises CameraError."""
-    named = [name for name in flat if _DISTORTION.fullmatch(name) and name not in _MODELS]
+    for name, model in _OTHER_LENSES.items():
+        if flat.get(name) not in (None, 0, "0") and not {"omega", "phi"} <= set(flat):  # kappa beside them is an angle
+            raise CameraError(
+                f"its lens is of {model} ({name}: {flat[name]!r}), which posekit does not have: calibrate with "
+                "OpenCV's pinhole or fisheye model, or undistort the picture yourself and leave the distortion out."
+            )
+    shapes = (_DISTORTION, *_PARTS)
+    named = [name for name in flat if any(shape.fullmatch(name) for shape in shapes) and name not in _MODELS]
     lists: dict[str, list[float]] = {}
     for name in named:
         if flat[name] is None or isinstance(flat[name], bool):
@@ -356,15 +385,26 @@ def _distortion(flat: Mapping[str, Any]) -> tuple[tuple[float, ...], str]:
     single = {name: float(flat[name]) for name in flat if _COEFFICIENT.fullmatch(name) and flat[name] is not None}
     lists = {name: values for name, values in lists.items() if any(v != 0 for v in values)}
     fisheye = _is_fisheye(flat, bool(lists) or any(single.values()))
-    if "radialdistortion" in lists or "tangentialdistortion" in lists:  # MATLAB
-        radial = [*lists.pop("radialdistortion", []), 0.0, 0.0, 0.0][:3]
-        lists["matlab"] = [*radial[:2], *lists.pop("tangentialdistortion", [0.0, 0.0]), radial[2]]
+    radial, tangential = ([lists.pop(name) for name in list(lists) if part.fullmatch(name)] for part in _PARTS)
+    if radial or tangential:  # as MATLAB has them
+        lists["radial and tangential"] = _together(radial, tangential)
     if any(single.values()):
         lists["k1"] = _in_order(single, fisheye)
     kinds = list(lists.values())
     if any(values != kinds[0] for values in kinds[1:]):
         raise CameraError(f"it gives lens distortion twice, differently ({', '.join(lists)}): keep one.")
     return (tuple(kinds[0]) if kinds else ()), ("fisheye" if fisheye else "pinhole")
+
+
+def _together(radial: list[list[float]], tangential: list[list[float]]) -> list[float]:
+    """Coefficients in lists of radial and of tangential ones as OpenCV lists them. Raises CameraError."""
+    ks, ps = (found[0] if found else [] for found in (radial, tangential))
+    if len(radial) > 1 or len(tangential) > 1 or len(ks) not in (0, 1, 2, 3, 6) or len(ps) not in (0, 2):
+        raise CameraError(
+            f"its lens distortion is radial {radial} and tangential {tangential}: 3 or 6 numbers and 2 are read."
+        )
+    ks, ps = ([*ks, 0.0, 0.0, 0.0][: max(3, len(ks))], ps or [0.0, 0.0])
+    return [*ks[:2], *ps, *ks[2:]]
 
 
 def _in_order(single: Mapping[str, float], fisheye: bool) -> list[float]:
@@ -381,7 +421,8 @@ def _in_order(single: Mapping[str, float], fisheye: bool) -> list[float]:
 
 def _is_fisheye(flat: Mapping[str, Any], distorted: bool) -> bool:
     """Whether the file speaks of OpenCV's fisheye. Raises CameraError for models that posekit does not have."""
-    found = flat.get("isfisheye") is True or flat.get("fisheye") is True
+    flags = ("isfisheye", "fisheye", "fisheyemodel", "usefisheye")  # OpenCV's sample writes fisheye_model
+    found = any(str(flat.get(flag)).lower() in ("true", "1", "1.0") for flag in flags)
     for name in _MODELS:
         if not isinstance(flat.get(name), str):
             continue
@@ -417,6 +458,11 @@ def _on_picture(camera: Camera, coefficients: tuple[float, ...], model: str, siz
             )
         log.info("%s: scaled from %dx%d to the picture's %dx%d pixels.", label, *camera.size, *size)
         camera = camera.resized(*size)
+    if camera.fx < _SHORTEST * size[0] or camera.fy < _SHORTEST * size[1]:
+        raise CameraError(
+            f"{label}: the focal length ({camera.fx:g}, {camera.fy:g}) is no number of pixels for a picture of "
+            f"{size[0]}x{size[1]}: give fx, fy, cx, cy in pixels, not as shares of the picture or in mm."
+        )
     off = max(abs(camera.cx / size[0] - 0.5), abs(camera.cy / size[1] - 0.5))
     if off > _FAR:
         inside = 0 <= camera.cx < size[0] and 0 <= camera.cy < size[1]

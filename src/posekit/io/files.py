@@ -31,6 +31,28 @@ def write_bytes_atomic(path: Path, data: bytes) -> None:
         raise
 
 
+def read_text(path: Path) -> str:
+    """A text file in UTF-8, or in what its byte order mark says; line ends become \\n. Raises OSError, and
+    UnicodeDecodeError (a ValueError) where it is no such text."""
+    return decoded(path.read_bytes()).replace("\r\n", "\n").replace("\r", "\n")
+
+
+def decoded(data: bytes) -> str:
+    """A text file's bytes as `read_text` decodes them; line ends stay. Raises UnicodeDecodeError."""
+    wide = data[:2] in (b"\xff\xfe", b"\xfe\xff")  # as PowerShell writes
+    return data.decode("utf-16" if wide else "utf-8-sig")
+
+
+def other_content(data: bytes) -> str | None:
+    """What a file holds instead of what its name says, as the end of a sentence; None where nothing is known of it."""
+    head = data[:300].lstrip().lower()
+    if head.startswith(b"version https://git-lfs"):
+        return "holds a pointer of Git LFS instead of the data: get them with git lfs pull"
+    if head.startswith((b"<!doctype html", b"<html")):
+        return "holds a web page instead of the data: download it again, and look whether a login or a link is needed"
+    return None
+
+
 def user_cache(name: str) -> Path:
     """The folder for what can be made anew: under XDG_CACHE_HOME, else ~/.cache. It need not exist."""
     root = os.environ.get("XDG_CACHE_HOME")

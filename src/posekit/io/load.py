@@ -8,7 +8,7 @@ import logging
 import math
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from posekit.camera import Box, Camera
 from posekit.errors import CameraError, ImageError, InputError, PromptError
 from posekit.geometry import Pose, nearest_rotation
 from posekit.io.calibration import Calibration, load_calibration
+from posekit.io.files import other_content, read_text
 from posekit.io.limits import limit
 from posekit.io.pixels import deep_colour, eight_bit, upright
 from posekit.io.pose_formats import pose_from_mapping, pose_from_text
@@ -86,6 +87,12 @@ def load_image(path: str | Path) -> NDArray[np.uint8]:
                 f"{path.name} is {width}x{height} pixels: at least {SMALLEST_SIDE}x{SMALLEST_SIDE} are needed. "
                 "Give the photograph itself."
             )
+        with suppress(Exception):  # Pillow counts by reading, and stumbles over what is damaged behind the first one
+            if image.format == "TIFF" and (pictures := getattr(image, "n_frames", 1)) > 1:
+                log.warning(
+                    "%s holds %d pictures: the first one, %dx%d pixels, is read.", path.name, pictures, width, height
+                )
+                image.seek(0)
         deep = deep_colour(path.read_bytes())
         if deep is not None:
             shallow = Image.fromarray(eight_bit(deep, path.name))
@@ -110,6 +117,7 @@ def load_mask(path: str | Path, size: Size | None = None, *, allow_empty: bool =
                 "a mask has the size of its picture."
             )
         mask = _covered(_brightness(image), path.name)
+        _refuse_labels(image, mask, path.name)
     if not mask.any() and not allow_empty:
         raise PromptError(f"the mask {path.name} is empty: its pixels must be brighter than 0 where the object is.")
     if mask[[0, 0, -1, -1], [0, -1, 0, -1]].all() and mask.mean() > 0.5:
@@ -118,6 +126,15 @@ def load_mask(path: str | Path, size: Size | None = None, *, allow_empty: bool =
             path.name, 100 * mask.mean(),
         )  # fmt: skip
     return mask
+
+
+_MOST_LABELS, _SAME_HUE = 64, 0.97
+_GREY_SHARE, _COLOUR_SHARE = 0.2, 0.01  # of the mask, that an area of another value or colour has
+_PHONES = " Phones save HEIC; they and most viewers export it as JPEG."
+_RAW = " A camera's raw file must be developed first: export it as JPEG or PNG."
+_WAY_OUT = dict.fromkeys((".heic", ".heif", ".hif"), _PHONES) | dict.fromkeys(
+    (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"), _RAW
+)
 
 
 @contextmanager
@@ -143,8 +160,11 @@ def _opened(path: Path, what: str, kind: type[InputError]) -> Iterator[Image.Ima
                     whole = _cut_short(path, image, error)
                 yield whole
     except UnidentifiedImageError as error:
+        if (content := other_content(path.read_bytes())) is not None:
+            raise kind(f"the {what} {path} {content}.") from error
         raise kind(
             f"the {what} {path} is not a picture that posekit reads: give a PNG, JPEG, TIFF, BMP or WebP."
+            f"{_WAY_OUT.get(path.suffix.lower(), '')}"
         ) from error
     except Image.DecompressionBombError as error:
         raise kind(_too_large(path, "far more pixels")) from error
@@ -223,6 +243,26 @@ def _covered(brightness: NDArray[np.float64], label: str) -> NDArray[np.bool_]:
             label, most, 100 * between.mean(),
         )  # fmt: skip
     return np.asarray(brightness > 0.5 * most)
+
+
+def _refuse_labels(image: Image.Image, mask: NDArray[np.bool_], label: str) -> None:
+    """Raises PromptError where what is bright enough has areas of several values or colours: labels of objects."""
+    grey = image.mode in ("1", "L", "F") or image.mode.startswith("I")
+    values = np.asarray(image if grey else image.convert("RGB"))[mask].reshape(-1, 1 if grey else 3)
+    kinds, counts = np.unique(values, axis=0, return_counts=True)
+    order = np.argsort(-counts, kind="stable")
+    large = kinds[order[counts[order] > (_GREY_SHARE if grey else _COLOUR_SHARE) * len(values)]].astype(float)
+    if len(kinds) > _MOST_LABELS or len(large) < 2:
+        return
+    first = large[0]
+    for other in large[1:]:
+        if not grey and first @ other > _SAME_HUE * np.linalg.norm(first) * np.linalg.norm(other):
+            continue  # a soft edge
+        shown = [f"{each[0]:g}" if grey else "#{:02x}{:02x}{:02x}".format(*each.astype(int)) for each in (first, other)]
+        raise PromptError(
+            f"the mask {label} has areas of {shown[0]} and {shown[1]}, as a picture of labels does: write a mask that "
+            "is 255 where the one object is, and 0 elsewhere."
+        )
 
 
 def parse_box(text: str, size: Size | None = None) -> Box:
@@ -314,7 +354,7 @@ def load_pose(path: str | Path) -> Pose:
         '"cam_t_m2c": 3 numbers in mm}, or a text file with a 4x4 matrix or x y z qx qy qz qw, in metres.'
     )
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_text(path)
         pose = _pose_from_json(json.loads(text), path, needed) if "{" in text else pose_from_text(text)
     except OSError as error:
         raise PromptError(f"the pose file {path} cannot be read ({error.strerror}): check the path.") from error

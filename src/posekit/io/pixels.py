@@ -14,6 +14,8 @@ from PIL import ExifTags, Image, ImageOps
 
 log = logging.getLogger("posekit")
 
+_FEW = 1e-4  # of the pixels
+_JPEG_2000 = (b"\0\0\0\x0cjP  \r\n\x87\n", b"\xff\x4f\xff\x51")
 _TURNS = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -33,8 +35,16 @@ def eight_bit(values: NDArray[np.integer], label: str) -> NDArray[np.uint8]:
     low, high = int(values.min(initial=0)), int(values.max(initial=0))
     if low < 0 or high > 65535:
         raise ValueError(f"{label} has pixels of more than 16 bits: convert it to an 8-bit picture.")
-    bits = next(bits for bits in (8, 10, 12, 14, 16) if high < 1 << bits)
-    if bits < 16:
+    used = int(np.quantile(values, 1 - _FEW, method="lower")) if high > 255 else high  # without a few hot pixels
+    bits, all_bits = (next(bits for bits in (8, 10, 12, 14, 16) if most < 1 << bits) for most in (used, high))
+    if bits < all_bits:
+        log.warning(
+            "%s: all but a few of its 16-bit pixels go up to %d only, so they are taken for %d bits; if it is really "
+            "that dark, convert it to 8 bits yourself.",
+            label, used, bits,
+        )  # fmt: skip
+        values = np.minimum(values, (1 << bits) - 1)
+    elif bits < 16:
         log.warning(
             "%s: its 16-bit pixels go up to %d only, so they are taken for %d bits; if it is really that dark, "
             "convert it to 8 bits yourself.",
@@ -44,11 +54,13 @@ def eight_bit(values: NDArray[np.integer], label: str) -> NDArray[np.uint8]:
 
 
 def deep_colour(data: bytes) -> NDArray[np.uint16] | None:
-    """A coloured PNG or TIFF of 16 bits a channel as RGB (H, W, 3), not turned, transparent parts black; None where the
-    file is something else. Pillow keeps the upper 8 bits alone, which are all black in a picture of 8 of them.
+    """A coloured PNG, TIFF or JPEG 2000 of 16 bits a channel as RGB (H, W, 3), not turned, transparent parts black;
+    None where the file is something else. Pillow keeps the upper 8 bits alone, which are all black in a picture of 8.
     """
     if data[:8] == b"\x89PNG\r\n\x1a\n":
         deep = len(data) > 26 and data[24] == 16 and data[25] in (2, 4, 6)
+    elif data.startswith(_JPEG_2000):
+        deep = True  # seen when it is decoded
     else:
         deep = data[:4] in (b"II*\0", b"MM\0*") and 16 in _tiff_depths(data)
     if not deep:
@@ -88,7 +100,14 @@ def _tiff_tag(data: bytes, order: str, wanted: int) -> tuple[int, ...]:
 
 
 def upright(image: Image.Image, label: str) -> Image.Image:
-    """A picture turned as its EXIF data says; where they are damaged but say the orientation, by that alone."""
+    """A picture turned as its EXIF data says; where they are damaged but say the orientation, by that alone.
+
+    EXIF data behind a second header are no EXIF data: viewers, browsers and OpenCV see none there, Pillow does.
+    """
+    data = image.info.get("exif")
+    if isinstance(data, bytes) and data.startswith(b"Exif\0\0" * 2) and orientation(image) != 1:
+        log.warning("%s: its EXIF data are damaged (a second header); the picture is read as it is stored.", label)
+        return image
     try:
         with warnings.catch_warnings(action="ignore"):
             return ImageOps.exif_transpose(image)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import glob
 import json
 import logging
-import math
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -24,6 +23,7 @@ from numpy.typing import NDArray
 from posekit.camera import Camera
 from posekit.errors import ImageError, InputError, OutputError
 from posekit.io.calibration import Calibration, calibration_of_entry, depends_on_picture, load_calibration
+from posekit.io.files import read_text
 from posekit.io.load import ASSUMED_FOV, camera_from_exif, load_image
 
 log = logging.getLogger("posekit")
@@ -120,7 +120,8 @@ def _only(cameras: list[Path]) -> Path:
 
 
 def _pictures(paths: Any, source: str) -> list[Path]:
-    found = sorted((path for path in paths if path.suffix.lower() in PICTURES), key=_natural)
+    shown = (path for path in paths if path.suffix.lower() in PICTURES and not path.name.startswith("."))
+    found = sorted(shown, key=_natural)
     if not found:
         raise InputError(f"{source} holds no pictures ({', '.join(PICTURES)}).")
     return found
@@ -207,7 +208,7 @@ class SceneFrames:
     def __init__(self, file: Path) -> None:
         """file: scene_camera.json, or a sensor's."""
         try:
-            cameras = json.loads(file.read_text(encoding="utf-8-sig"))
+            cameras = json.loads(read_text(file))
             self.cameras: Mapping[int, Any] = {int(k): v for k, v in sorted(cameras.items(), key=lambda kv: int(kv[0]))}
         except (OSError, ValueError, AttributeError, RecursionError) as error:
             raise InputError(f"{file} cannot be read: {error}.") from error
@@ -269,7 +270,7 @@ class VideoFrames:
                     continue
                 for found in decoded:
                     failures = 0
-                    image = _turned(found.to_ndarray(format="rgb24"), _rotation(found))
+                    image = _turned(found.to_ndarray(format="rgb24"), found)
                     start = found.time if start is None else start
                     seconds = None if found.time is None or start is None else found.time - start
                     yield self._frame(number, image, seconds)
@@ -283,17 +284,23 @@ class VideoFrames:
             return Frame(number, None, seconds=seconds, problem=f"frame {number}: {error}")
 
 
-def _rotation(frame: Any) -> float:
-    """Degrees counter-clockwise by which a player turns a frame: the display matrix that phones write."""
-    return float(getattr(frame, "rotation", 0) or 0)
+def _turned(image: Image, frame: Any) -> Image:
+    """The image as a player shows it, by the display matrix that phones write: turned, mirrored.
 
-
-def _turned(image: Image, degrees: float) -> Image:
-    """Raises ImageError where it is no quarter turn: no player shows such a video unframed."""
-    quarters = round(degrees / 90)
-    if not math.isclose(degrees, 90 * quarters, abs_tol=1):
-        raise ImageError(f"its frames are to be turned by {degrees:g} degrees: write it anew, upright, with ffmpeg.")
-    return np.ascontiguousarray(np.rot90(image, quarters))
+    Raises ImageError where it is no quarter turn: no player shows such a video unframed.
+    """
+    data = next((bytes(d) for d in getattr(frame, "side_data", ()) if d.type.name == "DISPLAYMATRIX"), b"")
+    if len(data) < 36:
+        return image
+    a, b, _, c, d, *_ = np.frombuffer(data, np.int32, 9).astype(np.float64)  # x' = a x + c y, y' = b x + d y
+    swapped = abs(b) + abs(c) > abs(a) + abs(d)
+    across, down = (c, b) if swapped else (a, d)
+    if not 0 < max(abs(a), abs(d), abs(b), abs(c)) * 0.98 <= min(abs(across), abs(down)):
+        raise ImageError(
+            f"its frames are to be turned by {frame.rotation:g} degrees: write it anew, upright, with ffmpeg."
+        )
+    shown = image.swapaxes(0, 1) if swapped else image
+    return np.ascontiguousarray(shown[:: 1 if down > 0 else -1, :: 1 if across > 0 else -1])
 
 
 def _opened(path: Path) -> Any:

@@ -13,11 +13,15 @@ from numpy.typing import NDArray
 
 from posekit.errors import MeshError
 from posekit.mesh.gltf import gltf_put_right
+from posekit.mesh.ply import triangles_alone
 from posekit.mesh.polygons import triangulated
 
 log = logging.getLogger("posekit")
 
-_CHANNELS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+_CHANNELS = (
+    ("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"),
+    ("ambient_red", "ambient_green", "ambient_blue"),
+)  # fmt: skip
 
 
 def put_right(kind: str, data: bytes, label: str, fetch: Callable[[str], bytes]) -> bytes:
@@ -27,6 +31,8 @@ def put_right(kind: str, data: bytes, label: str, fetch: Callable[[str], bytes])
         return _obj(data, label)
     if kind == ".stl":
         return _stl(data, label)
+    if kind == ".ply":
+        return triangles_alone(data, label)
     if kind in (".glb", ".gltf"):
         return gltf_put_right(kind, data, label, fetch)
     return data
@@ -37,7 +43,11 @@ def put_right(kind: str, data: bytes, label: str, fetch: Callable[[str], bytes])
 
 def _obj(data: bytes, label: str) -> bytes:
     """Polygons cut into triangles, and colours of 0 to 255 brought to 0 to 1."""
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        data = data.decode("utf-16", "replace").encode()
     data = re.sub(rb"\\\r?\n", b" ", data.removeprefix(b"\xef\xbb\xbf"))
+    if re.search(rb"^#MRGB ", data, re.MULTILINE):
+        log.warning("%s: its colours (ZBrush's #MRGB) are not read: export it as PLY with colours.", label)
     lines = data.splitlines()
     if re.search(rb"^\s*f[^\n]*[\s/]-\d", data, re.MULTILINE):
         _count_from_start(lines, label)
@@ -104,7 +114,11 @@ def _scale_colours(lines: list[bytes], vertices: list[int], label: str) -> None:
     except ValueError as error:
         raise MeshError(f"{label} has a vertex colour that is no number ({error}): export it again.") from error
     scaled = colours_8bit(colours, label)
-    if colours.max(initial=0) <= 1 or scaled is None:
+    if scaled is None:
+        for k, row in coloured:
+            lines[k] = b" ".join(row[:4])
+        return
+    if colours.max(initial=0) <= 1:
         return
     for (k, row), colour in zip(coloured, scaled / 255.0, strict=True):
         lines[k] = b" ".join(row[:-3]) + (" {:.6f} {:.6f} {:.6f}".format(*colour)).encode()
@@ -121,8 +135,11 @@ def _stl(data: bytes, label: str) -> bytes:
     there, rest = divmod(len(data) - 84, 50)
     if there and np.frombuffer(data, np.uint8, there * 50, 84).reshape(there, 50)[:, 48:].any():
         log.warning("%s: the colours of STL files have no common meaning and are not read; it is drawn grey.", label)
-    if told == there or (told < there and rest):
+    if told == there and not rest:
         return data
+    if there and told <= there and rest:
+        log.warning("%s: %d bytes follow its %d triangles and are not read.", label, len(data) - 84 - 50 * told, told)
+        return data[: 84 + 50 * told]
     if told > there and rest > 2:  # it ends within a triangle
         raise MeshError(
             f"{label} says that it has {told} triangles, and ends within number {there + 1}: it is cut off; copy or "
@@ -184,10 +201,11 @@ def ply_colours(element: Mapping[str, Any] | None, count: int, label: str) -> ND
     """The colours (count, 3) of a PLY's vertices or faces, in whatever numbers; None without any. What is not
     understood is told."""
     data, properties = (None, ()) if element is None else (element.get("data"), tuple(element.get("properties", ())))
+    spelled = {name.lower(): name for name in properties}
     for names in _CHANNELS:
-        if data is None or not set(names) <= set(properties):
+        if data is None or not set(names) <= set(spelled):
             continue
-        columns = np.column_stack([np.ravel(data[name]) for name in names])
+        columns = np.column_stack([np.ravel(data[spelled[name]]) for name in names])
         return colours_8bit(columns, label) if len(columns) == count else None
     odd = [name for name in properties if re.search(r"red|green|blue|colou?r|rgb|intensity|gr[ae]y", name.lower())]
     if odd:

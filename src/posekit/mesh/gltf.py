@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import json
+import logging
 import struct
 from collections.abc import Callable
 from contextlib import suppress
@@ -18,18 +19,24 @@ from posekit.errors import MeshError
 from posekit.io.limits import limit
 from posekit.io.pixels import deep_colour, eight_bit
 
+log = logging.getLogger("posekit")
+
 _COMPRESSED = {
     "KHR_draco_mesh_compression": "Draco",
     "EXT_meshopt_compression": "meshopt",
     "KHR_meshopt_compression": "meshopt",
 }
-_TRANSFORM = "KHR_texture_transform"
+_TRANSFORM, _GLOSSINESS = "KHR_texture_transform", "KHR_materials_pbrSpecularGlossiness"
+_UNDERSTOOD = {
+    _TRANSFORM, _GLOSSINESS, "KHR_mesh_quantization", "KHR_materials_unlit", "EXT_texture_webp", "KHR_texture_basisu",
+}  # fmt: skip
 _WRONG = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, struct.error)
 
 
 def gltf_put_right(kind: str, data: bytes, label: str, fetch: Callable[[str], bytes]) -> bytes:
     """A file's bytes with texture transforms (KHR_texture_transform) and the chosen set of texture coordinates applied,
-    and embedded textures of 16 bits made 8.
+    the colours of KHR_materials_pbrSpecularGlossiness where trimesh finds them, and embedded textures of 16 bits made
+    8. Transparent parts are told: they are drawn solid.
 
     kind: ".glb" or ".gltf". fetch: gives the bytes of a file that it names. Raises MeshError where the geometry is
     compressed, has too many corners, or where a transform cannot be applied.
@@ -46,23 +53,34 @@ def gltf_put_right(kind: str, data: bytes, label: str, fetch: Callable[[str], by
                 f"{label} is compressed with {name}, which posekit does not read: export it without compression "
                 f"(in Blender leave out Compression; or gltf-transform copy {label} plain.glb), or as PLY."
             )
+    if "KHR_texture_basisu" in used:
+        log.warning("%s: its textures are compressed with Basis Universal, which posekit does not read.", label)
+    if strange := sorted({*document.root.get("extensionsRequired", ())} - _UNDERSTOOD):
+        log.warning(
+            "%s needs %s, which posekit does not know: look at it with posekit render-views.", label, ", ".join(strange)
+        )
     most = 3 * limit("POSEKIT_MOST_FACES")
     if max(counts, default=0) > most:
         raise MeshError(
             f"{label} says that it has {max(counts)} numbers in a row, at most {most} are read: simplify the mesh, or "
             "set POSEKIT_MOST_FACES."
         )
+    changed = False
+    with suppress(*_WRONG):  # trimesh says what is wrong
+        changed = _plain_materials(document)
     try:
-        changed = _move_coordinates(document)
+        changed |= _move_coordinates(document)
     except (*_WRONG, FileNotFoundError) as error:
         if _TRANSFORM not in used:
-            return data
+            return document.data() if changed else data
         raise MeshError(
             f"{label}: its texture transform cannot be applied ({type(error).__name__}: {error}): export it without, "
             "or as OBJ."
         ) from error
     with suppress(*_WRONG):  # a texture that is no picture: trimesh says so
         changed |= _shallow_textures(document, label)
+    with suppress(Exception):  # Pillow raises what it stumbles over, and who reads the texture says so
+        _tell_transparent(document, label)
     return document.data() if changed else data
 
 
@@ -96,6 +114,15 @@ class _Document:
             if self.binary is None or number:
                 raise ValueError(f"buffer {number} is nowhere")
             return self.binary
+        return self._named(uri)
+
+    def file(self, image: dict[str, Any]) -> bytes:
+        """The bytes of a texture's file, wherever it is."""
+        if "bufferView" in image:
+            return self.view(image["bufferView"])[0]
+        return self._named(image["uri"])
+
+    def _named(self, uri: str) -> bytes:
         return base64.b64decode(uri.partition(",")[2]) if uri.startswith("data:") else self._fetch(uri)
 
     def add(self, content: bytes) -> int:
@@ -161,10 +188,41 @@ def _move_coordinates(document: _Document) -> bool:
     return changed
 
 
+def _plain_materials(document: _Document) -> bool:
+    """Diffuse colour and texture of KHR_materials_pbrSpecularGlossiness as the base colour; trimesh would make them
+    white where the specular colour is not given. Whether there was one."""
+    changed = False
+    for material in document.root.get("materials", ()):
+        old = material.get("extensions", {}).pop(_GLOSSINESS, None)
+        if old is None:
+            continue
+        plain = material.setdefault("pbrMetallicRoughness", {})
+        if "diffuseTexture" in old or "baseColorTexture" not in plain:
+            for key in ("baseColorTexture", "baseColorFactor"):
+                plain.pop(key, None)
+            if "diffuseTexture" in old:
+                plain["baseColorTexture"] = old["diffuseTexture"]
+            plain["baseColorFactor"] = old.get("diffuseFactor", [1, 1, 1, 1])
+        changed = True
+    return changed
+
+
 def _colour_texture(material: dict[str, Any]) -> dict[str, Any]:
-    plain = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
-    old = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {}).get("diffuseTexture")
-    return dict(plain or old or {})
+    return dict(material.get("pbrMetallicRoughness", {}).get("baseColorTexture", {}))
+
+
+def _tell_transparent(document: _Document, label: str) -> None:
+    """Warn of materials that are transparent in part or in whole."""
+    for number, material in enumerate(document.root.get("materials", ())):
+        if material.get("alphaMode", "OPAQUE") == "OPAQUE":
+            continue
+        least = float(material.get("pbrMetallicRoughness", {}).get("baseColorFactor", (1, 1, 1, 1))[3])
+        if texture := _colour_texture(material):
+            image = document.root["images"][document.root["textures"][texture["index"]]["source"]]
+            least *= _least_alpha(document.file(image))
+        if least < float(material.get("alphaCutoff", 0.5)):
+            name = material.get("name") or f"number {number}"
+            log.warning("%s: parts of the material %s are transparent; they are drawn solid.", label, name)
 
 
 def _turn(moved: dict[str, Any]) -> NDArray[np.float64]:
@@ -175,17 +233,22 @@ def _turn(moved: dict[str, Any]) -> NDArray[np.float64]:
     return np.array([[cosine, sine], [-sine, cosine]]) * np.asarray(moved.get("scale", (1.0, 1.0)), dtype=np.float64)
 
 
+def _least_alpha(content: bytes) -> float:
+    """The least opacity of a texture, 0 to 1."""
+    with Image.open(io.BytesIO(content)) as picture:
+        small = picture.width * picture.height <= limit("POSEKIT_MOST_PIXELS")
+        if not (small and picture.has_transparency_data):
+            return 1.0
+        return float(np.asarray(picture.convert("RGBA"))[..., 3].min()) / 255.0
+
+
 def _shallow_textures(document: _Document, label: str) -> bool:
     """Embedded coloured PNGs of 16 bits as 8. Whether there was one."""
     changed = False
     for image in document.root.get("images", ()):
-        if "bufferView" in image:
-            content = document.view(image["bufferView"])[0]
-        elif str(image.get("uri", "")).startswith("data:"):
-            content = base64.b64decode(image["uri"].partition(",")[2])
-        else:
+        if "bufferView" not in image and not str(image.get("uri", "")).startswith("data:"):
             continue  # a file of its own, read by who reads files
-        deep = deep_colour(content)
+        deep = deep_colour(document.file(image))
         if deep is None:
             continue
         file = io.BytesIO()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import logging
 import urllib.parse
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from posekit.errors import MeshError
+from posekit.io.files import other_content
 from posekit.io.limits import limit
 from posekit.io.pixels import deep_colour, eight_bit
 from posekit.mesh.atlas import Part
-from posekit.mesh.formats import ply_colours, ply_faces, put_right
+from posekit.mesh.formats import colours_8bit, ply_colours, ply_faces, put_right
 from posekit.mesh.processing import checked_mesh
 
 log = logging.getLogger("posekit")
@@ -53,7 +55,10 @@ class _Assets(trimesh.resolvers.FilePathResolver):
         if found.suffix.lower() in (".mtl", ".bin"):
             return data
         try:
-            with Image.open(io.BytesIO(data)) as image:
+            with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(data)) as image:  # of the size
+                if (large := _too_many_pixels(image)) is not None:
+                    self.problem = self.problem or large
+                    raise FileNotFoundError(name)
                 image.load()
         except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
             self.problem = self.problem or f"has the texture {found}, which is not a readable picture ({error})"
@@ -87,6 +92,7 @@ def _spellings(name: str) -> list[str]:
     """What a file may be called that a mesh names: as it stands, without an MTL's options before it, %20 decoded, and
     its base name alone, of paths on other machines."""
     plain = [name, name.split()[-1]] if name.startswith("-") and name.split() else [name]
+    plain += [each.split(" #")[0].rstrip() for each in plain if " #" in each]  # a comment
     decoded = [urllib.parse.unquote(each) for each in plain]
     return list(dict.fromkeys([*plain, *decoded, *(each.rsplit("/", 1)[-1] for each in decoded)]))
 
@@ -106,6 +112,8 @@ def read_parts(path: Path) -> list[Part]:
         raise MeshError(f"the mesh {path} cannot be read: {error.strerror}.") from error
     if not data.strip():
         raise MeshError(f"{path.name} is an empty file: export the mesh again.")
+    if (content := other_content(data)) is not None:
+        raise MeshError(f"{path.name} {content}.")
     assets = _Assets(path)
     try:
         loaded = trimesh.load(
@@ -136,6 +144,17 @@ def _check_bytes(path: Path) -> None:
             f"{path.name} has {size / 1e6:.0f} MB, at most {most / 1e6:.0f} MB are read: simplify the mesh, or set "
             "POSEKIT_MOST_MESH_BYTES."
         )
+
+
+def _too_many_pixels(image: Image.Image) -> str | None:
+    """What is wrong with a texture that is too large to be read."""
+    most = limit("POSEKIT_MOST_PIXELS")
+    if image.width * image.height <= most:
+        return None
+    return (
+        f"has a texture of {image.width}x{image.height} pixels, at most {most / 1e6:g} megapixels are read: scale it "
+        "down, or set POSEKIT_MOST_PIXELS"
+    )
 
 
 def _reading_options(path: Path, data: bytes) -> dict[str, Any]:
@@ -217,14 +236,20 @@ def _with_material(part: Part, mesh: Any, label: str) -> Part:
     uvs = mesh.visual.uv
     factor = getattr(material, "baseColorFactor", None)  # glTF
     if factor is None and "kd" in getattr(material, "kwargs", {}):  # MTL
-        factor = material.diffuse
+        scaled = colours_8bit(np.asarray([material.kwargs["kd"]], dtype=np.float64), label)
+        factor = None if scaled is None else scaled[0]
     if image is not None and uvs is not None and len(uvs) == count:
+        if (large := _too_many_pixels(image)) is not None:
+            raise MeshError(f"{label} {large}.")
         deep = image.mode.startswith("I")  # 16 bits of grey
         grey = eight_bit(np.asarray(image).astype(np.int64), label) if deep else None
         texture = np.asarray((image if grey is None else Image.fromarray(grey)).convert("RGB"), dtype=np.uint8)
         if factor is not None and not hasattr(material, "image"):  # in MTL files Kd beside a texture is mostly noise
-            texture = np.rint(texture * (np.asarray(factor, dtype=np.float64)[:3] / 255.0)).astype(np.uint8)
-        return replace(part, uvs=np.asarray(uvs, dtype=np.float64), texture=texture)
+            texture = _scaled(texture, np.asarray(factor, dtype=np.float64)[:3] / 255.0)
+        places = np.asarray(uvs, dtype=np.float64)
+        if places.ndim != 2 or places.shape[1] < 2:
+            raise MeshError(f"{label} has texture coordinates that are no pairs of numbers: export it again.")
+        return replace(part, uvs=places[:, :2], texture=texture)
     if image is not None:
         log.warning("%s: a part has a texture but no texture coordinates; it gets its material's one colour.", label)
     colors = mesh.visual.vertex_attributes.get("color")
@@ -236,6 +261,14 @@ def _with_material(part: Part, mesh: Any, label: str) -> Part:
         log.warning("%s: a part has texture coordinates but no texture and no colour; it is drawn grey.", label)
         return part
     return replace(part, colors=np.tile(np.asarray(factor)[:3].astype(np.uint8), (count, 1)))
+
+
+def _scaled(texture: NDArray[np.uint8], factor: Floats) -> NDArray[np.uint8]:
+    """A texture (H, W, 3) times a colour (3,) in [0, 1]."""
+    if (factor == 1).all():
+        return texture
+    tables = np.rint(np.arange(256)[:, None] * factor).astype(np.uint8)
+    return np.stack([tables[:, k][texture[..., k]] for k in range(3)], axis=-1)
 
 
 def _placed(part: Part, transform: Floats) -> Part:

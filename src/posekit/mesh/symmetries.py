@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from posekit.errors import MeshError
 from posekit.geometry import Pose, hat, rotation_angle, so3_exp
+from posekit.io.files import read_text
 from posekit.mesh.units import UNITS
 
 _MOST_SYMMETRIES = 720
@@ -178,7 +179,7 @@ def symmetries_of(given: str | Symmetries | None, path: Path, center: Floats) ->
 def _symmetries_from_file(file: Path, mesh: Path) -> Symmetries:
     """The entry for a mesh in a file of models_info.json's form, or of an entry's own form (mm)."""
     try:
-        data = json.loads(file.read_text(encoding="utf-8-sig"))
+        data = json.loads(read_text(file))
         if not isinstance(data, dict):
             raise ValueError("its outermost part is not {...}")
         number = re.fullmatch(r"obj_(\d+)", mesh.stem)

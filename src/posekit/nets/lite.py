@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from posekit.errors import ConfigError
 from posekit.nets.heads import PoseHeads, Prediction, expand_angle
 from posekit.nets.rigid import Motion, Surface, induced_flow, solve_motion
 
@@ -25,6 +26,8 @@ CELL = 8  # pixels per cell
 ANCHOR = 4  # pixels per anchor of the dense head; the first anchor is pixel (2, 2)
 FACTS = 9  # see `facts_of`
 PAIR = 11  # channels that the tower over both crops sees: two RGB pictures, mask, normals, relief
+
+_MOST_CHANNELS, _MOST_BLOCKS = 4096, 64
 
 
 @dataclass(frozen=True)
@@ -37,6 +40,21 @@ class LiteConfig:
     blocks: int = 6  # exchanges
     bottleneck: int = 96  # channels of their 3x3 convolutions
     fine: int = 48  # channels of the dense head
+
+    def __post_init__(self) -> None:
+        """Raises ConfigError where no network can be made of it."""
+        numbers = (*self.size, *self.widths, self.heads, self.blocks, self.bottleneck, self.fine)
+        if len(self.size) != 2 or len(self.widths) != 2 or any(type(n) is not int for n in numbers):
+            raise ConfigError(f"lite: size and widths are pairs of whole numbers, the rest whole numbers, not {self}.")
+        if min(numbers) < 1 or max(numbers) > _MOST_CHANNELS or self.blocks > _MOST_BLOCKS:
+            raise ConfigError(
+                f"lite: its numbers are from 1 to {_MOST_CHANNELS}, blocks at most {_MOST_BLOCKS}, not {self}."
+            )
+        if any(side % CELL for side in self.size) or self.widths[1] % self.heads:
+            raise ConfigError(
+                f"lite: size {self.size} is in multiples of {CELL} pixels, and heads {self.heads} divide the "
+                f"{self.widths[1]} channels at 1/8."
+            )
 
     @property
     def cells(self) -> tuple[int, int]:

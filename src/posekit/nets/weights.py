@@ -16,14 +16,15 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
-from posekit.errors import WeightsError
-from posekit.io.files import write_bytes_atomic, write_text_atomic
+from posekit.errors import ConfigError, WeightsError
+from posekit.io.files import other_content, write_bytes_atomic, write_text_atomic
 from posekit.nets.lite import LiteConfig, LiteSVNet
 from posekit.nets.mvnet import MatchingMVNet
 from posekit.nets.paper import Branch, PaperMVNet, PaperSVNet
 
 PRESETS = ("lite", "paper")
 SHARED = ("branch.", "tower.")  # what MV-Net has from SV-Net
+_LONGEST_SIDE, _WIDEST = 4096, 16
 SHIPPED = Path(__file__).resolve().parent.parent / "weights"
 
 
@@ -34,6 +35,14 @@ class PaperConfig:
     size: tuple[int, int] = (640, 480)  # (width, height) of the crop;
     width: float = 1.0  # share of FlowNetS's channels;
     views: int = 6  # MV-Net's
+
+    def __post_init__(self) -> None:
+        """Raises ConfigError where no network can be made of it."""
+        numbers = (*self.size, self.views)
+        if len(self.size) != 2 or any(type(n) is not int or not 1 <= n <= _LONGEST_SIDE for n in numbers):
+            raise ConfigError(f"paper: size and views are whole numbers from 1 to {_LONGEST_SIDE}, not {self}.")
+        if isinstance(self.width, bool) or not 0 < self.width <= _WIDEST:
+            raise ConfigError(f"paper: width is above 0 and at most {_WIDEST}, not {self.width}.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +140,8 @@ def load_networks(preset: str, path: Path | None = None) -> Networks:
     except FileNotFoundError as error:
         raise WeightsError(f"{file.name} needs {about_file.name} beside it: {error}") from error
     except (OSError, ValueError, RecursionError, SafetensorError) as error:
+        if file.is_file() and (content := other_content(file.read_bytes())) is not None:
+            raise WeightsError(f"{file} {content}.") from error
         raise WeightsError(f"the weights {file} are damaged: {error}. Fetch or train them anew.") from error
     if head.get("preset") != preset:
         raise WeightsError(f"{file} holds weights of preset {head.get('preset')!r}, not {preset!r}.")
@@ -164,7 +175,9 @@ def _built(preset: str, values: Any, state: Mapping[str, Tensor], file: Path) ->
         if parameters != stored:
             raise ValueError(f"its networks have {parameters} numbers, the file {stored}")
         return networks
-    except (TypeError, ValueError, IndexError, AttributeError, OverflowError, ZeroDivisionError, RuntimeError) as error:
+    except (
+        ConfigError, TypeError, ValueError, IndexError, AttributeError, OverflowError, ZeroDivisionError, RuntimeError
+    ) as error:  # fmt: skip
         first = str(error).partition("\n")[0]
         raise WeightsError(f"the configuration of the weights {file} makes no networks ({first}).") from error
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,6 +14,7 @@ from typing import Any, TypeVar
 import tomli_w
 
 from posekit.errors import ConfigError
+from posekit.io.files import read_text
 from posekit.nets.lite import LiteConfig
 from posekit.nets.losses import DenseLossConfig
 from posekit.nets.weights import PaperConfig
@@ -27,6 +29,17 @@ C = TypeVar("C")
 def _one_of(name: str, value: str, choices: tuple[str, ...]) -> None:
     if value not in choices:
         raise ConfigError(f"{name} is one of {', '.join(choices)}, not {value!r}.")
+
+
+def _sensible(values: Mapping[str, Any], table: str) -> None:
+    """Raises ConfigError for a number that is not finite or negative: nothing in a training is."""
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            _sensible(value, f"{table}{key}.")
+            continue
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, int | float) and not 0 <= number < math.inf:
+                raise ConfigError(f"{table}{key} is {value}: numbers are finite and not negative.")
 
 
 @dataclass(frozen=True)
@@ -120,6 +133,7 @@ class TrainConfig:
             raise ConfigError("steps, validate, save, log and keep are at least 1.")
         if min(self.minutes, self.cases, self.epochs, self.calibrate, self.export_seconds) < 0:
             raise ConfigError("minutes, epochs, cases, calibrate and export_seconds are not negative.")
+        _sensible(dataclasses.asdict(self), "")
 
     @property
     def world(self) -> int:
@@ -140,7 +154,7 @@ def default_config(recipe: str) -> TrainConfig:
 def read_config(path: Path) -> TrainConfig:
     """A TOML file; what it does not name stays as `default_config` has it. Raises ConfigError."""
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
+        values = tomllib.loads(read_text(path))
     except FileNotFoundError as error:
         raise ConfigError(f"there is no configuration {path}.") from error
     except (OSError, ValueError, RecursionError) as error:  # also thousands of digits, or of brackets

@@ -28,7 +28,7 @@ from posekit.detect.maskrcnn import (
     save_detector,
 )
 from posekit.errors import ConfigError, OutputError
-from posekit.io.files import write_text_atomic
+from posekit.io.files import read_text, write_text_atomic
 from posekit.render import Renderer
 from posekit.train.config import MachineConfig, OptimiserConfig, SourceConfig, changed, write_config
 from posekit.train.data.stream import Batch
@@ -99,7 +99,7 @@ def default_config(backbone: str = "lite0") -> DetectorConfig:
 def read_config(path: Path) -> DetectorConfig:
     """A TOML file; what it does not name stays as `default_config` has it. Raises ConfigError."""
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
+        values = tomllib.loads(read_text(path))
     except FileNotFoundError as error:
         raise ConfigError(f"there is no configuration {path}.") from error
     except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
