@@ -12,8 +12,9 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from posekit.camera import box_mask, mask_iou
 from posekit.datasets.bop import BopDataset
-from posekit.detect.prompts import clip_box, filled_mask, grabcut_mask
+from posekit.detect.prompts import clip_box, grabcut_mask
 
 NAMES = ("filled", "grabcut")
 
@@ -37,11 +38,11 @@ def main() -> None:
             started = time.perf_counter()
             found = grabcut_mask(view.image, box)
             seconds += time.perf_counter() - started
-            filled = filled_mask(box, view.camera)
+            filled = box_mask(box, view.camera.size)
             truth = instance.mask()
             refused += found is None
             masks = [filled, filled if found is None else found]
-            overlaps.append([(mask & truth).sum() / (mask | truth).sum() for mask in masks])
+            overlaps.append([mask_iou(mask, truth) for mask in masks])
             objects.append(instance.obj_id)
     report(np.array(overlaps), np.array(objects))
     print(f"{len(objects)} boxes, {refused} where GrabCut was refused, {1000 * seconds / len(objects):.0f} ms each")

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from posekit.camera import Box, mask_box
+from posekit.camera import box_iou, mask_box, mask_iou
 from posekit.datasets.bop import BopDataset
 from posekit.detect.coco import Found, Truth, average_precision
 from posekit.detect.novel import make_detector
@@ -67,7 +67,7 @@ def main() -> None:
                 best: Any = max(mine, key=lambda d: d.score, default=None)
                 overlaps = (0.0, 0.0)
                 if best is not None:
-                    overlaps = box_iou(best.box, box), float((best.mask & mask).sum() / (best.mask | mask).sum())
+                    overlaps = box_iou(best.box, box), mask_iou(best.mask, mask)
                 hits[instance.obj_id].append((overlaps[0] >= 0.5, overlaps[1] >= 0.5))
     for number, rows in hits.items():
         if rows:
@@ -88,14 +88,6 @@ def as_found(detections: Sequence[Detection], numbers: dict[str, int], size: tup
         np.array([d.score for d in detections], np.float32),
         np.array(masks, bool).reshape(-1, size[1], size[0]),
     )
-
-
-def box_iou(a: Box, b: Box) -> float:
-    width = min(a[2], b[2]) - max(a[0], b[0])
-    height = min(a[3], b[3]) - max(a[1], b[1])
-    both = max(0.0, width) * max(0.0, height)
-    area = (a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1])
-    return both / max(area - both, 1e-9)
 
 
 if __name__ == "__main__":

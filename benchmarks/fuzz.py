@@ -361,7 +361,7 @@ def configurations() -> list[Case]:
 def weights() -> list[Case]:
     import torch
 
-    from posekit.nets.lite import LiteConfig
+    from posekit.nets.config import LiteConfig
     from posekit.nets.weights import build, save_networks
 
     torch.manual_seed(0)  # an input that is made again is the same

@@ -1,10 +1,11 @@
 """How many small faults the tests catch: single-operator mutants of modules, each run against its own test files.
 
-    python benchmarks/mutants.py [MODULE ...] [--count N] [--seed N] [--seconds N]
+    python benchmarks/mutants.py [MODULE ...] [--count N] [--seed N] [--seconds N] [--among FILE]
 
 A mutant changes one operator, comparison, sign, number, or call (abs, min, max) of a module, in memory alone. Each is
 run in a process of its own, forked from this one; a mutant that runs longer than --seconds counts as killed. Prints
-each living mutant with its line, and the share of killed ones of every module.
+each living mutant with its line, and the share of killed ones of every module. --among: only the mutants that an
+earlier run printed as living, to see which of them new tests catch. docs/mutation.md has the result.
 """
 
 from __future__ import annotations
@@ -14,33 +15,44 @@ import ast
 import contextlib
 import copy
 import importlib.machinery
+import inspect
 import io
+import multiprocessing
 import os
 import random
 import signal
 import sys
 import time
+import types
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2  # noqa: F401 - what tests import is loaded once, before the forks
+import cv2
+import moderngl  # noqa: F401 - what tests import is loaded once, before the forks
 import numpy as np  # noqa: F401
+import PIL.Image
+import pycocotools.cocoeval  # noqa: F401
 import pytest
 import scipy.spatial  # noqa: F401
-import torch  # noqa: F401
+import torch
+import trimesh  # noqa: F401
+from _pytest.main import pytest_runtestloop
+from hypothesis import Phase, settings
 
 HERE = Path(__file__).resolve().parent.parent
 MODULES = {
     "geometry": ["test_geometry"],
-    "camera": ["test_geometry", "test_zoom"],
-    "zoom": ["test_geometry", "test_zoom"],
+    "camera": ["test_camera", "test_zoom"],
+    "zoom": ["test_zoom"],
     "metrics": ["test_metrics"],
     "align/gauss_newton": ["test_gauss_newton", "test_pnp"],
     "align/pnp": ["test_pnp"],
-    "align/mask_edge": ["test_mask_edge", "test_gauss_newton"],
+    "align/mask_edge": ["test_gauss_newton", "test_mask_edge"],
+    "align/colour_edge": ["test_colour_edge"],
     "results": ["test_results"],
     "datasets/bop": ["test_bop"],
 }
+RENDERED = {"align/mask_edge"}
 OPERATORS: dict[type, type] = {
     ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Mult,
     ast.MatMult: ast.Add, ast.Pow: ast.Mult, ast.Lt: ast.GtE, ast.GtE: ast.Lt, ast.Gt: ast.LtE, ast.LtE: ast.Gt,
@@ -108,23 +120,96 @@ def _put(parent: ast.AST, name: str, k: int, child: ast.AST) -> None:
         setattr(parent, name, child)
 
 
-def killed(path: Path, tree: ast.Module, tests: list[str], seconds: float) -> bool:
-    """Whether the tests fail with a module's mutant."""
-    child = os.fork()
-    if child == 0:
-        _live(path, tree, tests)
-    until = time.monotonic() + seconds
-    while time.monotonic() < until:
-        done, status = os.waitpid(child, os.WNOHANG)
-        if done:
-            return os.waitstatus_to_exitcode(status) != 0
-        time.sleep(0.02)
-    os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    return True
+def _told(module: str, line: int, text: str) -> str:
+    return f"lives: {module}:{line}: {text}"
 
 
-def _live(path: Path, tree: ast.Module, tests: list[str]) -> None:
+class Mutation:
+    """A pytest plugin that runs the collected tests once as they are and then once for every mutant, each in a process
+    forked after the collection, so that a mutant costs its tests alone. lost: how many were killed; None where the
+    tests fail without a mutant."""
+
+    def __init__(self, module: str, chosen: list[tuple[int, str, ast.Module]], seconds: float) -> None:
+        self.module, self.chosen, self.seconds = module, chosen, seconds
+        self.path = HERE / "src/posekit" / f"{module}.py"
+        self.lost: int | None = None
+
+    def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        # what renders does not survive a fork: where tests render, all of it happens in the children
+        if self._killed(session, None) if self.module in RENDERED else _fails(session):
+            return True
+        self.lost = 0
+        for line, text, mutant in self.chosen:
+            if self._killed(session, mutant):
+                self.lost += 1
+            else:
+                os.write(1, f"{_told(self.module, line, text)}\n".encode())
+        return True
+
+    def _killed(self, session: pytest.Session, mutant: ast.Module | None) -> bool:
+        child = os.fork()
+        if child == 0:
+            code = 1
+            with contextlib.suppress(BaseException):
+                if mutant is None or _exchanged(self.path, mutant):
+                    code = _fails(session)
+                else:
+                    _import_mutant(self.path, mutant)
+                    code = int(pytest.main(_options(self.module)))
+            os._exit(code)
+        until = time.monotonic() + self.seconds
+        while time.monotonic() < until:
+            done, status = os.waitpid(child, os.WNOHANG)
+            if done:
+                return os.waitstatus_to_exitcode(status) != 0
+            time.sleep(0.02)
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        return True
+
+
+def _fails(session: pytest.Session) -> bool:
+    with contextlib.suppress(session.Failed):
+        pytest_runtestloop(session)
+    return bool(session.testsfailed)
+
+
+def _options(module: str) -> list[str]:
+    return ["-x", "-q", "--tb=no", "-p", "no:cacheprovider", *(f"tests/{name}.py" for name in MODULES[module])]
+
+
+def _exchanged(path: Path, tree: ast.Module) -> bool:
+    """Put the mutant's code into the functions of a module that is imported already. False where it is not, or where
+    the mutant is outside functions."""
+    name = ".".join(path.relative_to(HERE / "src").with_suffix("").parts)
+    if name not in sys.modules:
+        return False
+    new = _functions(compile(ast.fix_missing_locations(tree), str(path), "exec"))
+    old = _functions(compile(path.read_text(), str(path), "exec"))
+    changed = [key for key in new if new[key] != old[key]]
+    for key in changed:
+        found: object = sys.modules[name]
+        for part in key.split("."):
+            found = vars(found)[part]
+        for inner in ("fget", "__func__", "func", "__wrapped__"):
+            found = getattr(found, inner, found)
+        found.__code__ = new[key]  # type: ignore[attr-defined]
+    return bool(changed)
+
+
+def _functions(code: types.CodeType) -> dict[str, types.CodeType]:
+    """The code of every function of a module and its classes, by qualified name."""
+    found = {}
+    for inner in (c for c in code.co_consts if isinstance(c, types.CodeType)):
+        if inner.co_flags & inspect.CO_NEWLOCALS and inner.co_flags & inspect.CO_OPTIMIZED:
+            found[inner.co_qualname] = inner
+        else:
+            found |= _functions(inner)
+    return {key: value for key, value in found.items() if "<" not in key}
+
+
+def _import_mutant(path: Path, tree: ast.Module) -> None:
+    """Have the mutant imported in place of the module."""
     usual = importlib.machinery.SourceFileLoader.get_code
 
     def get_code(loader: importlib.machinery.SourceFileLoader, name: str):  # type: ignore[no-untyped-def]
@@ -133,13 +218,9 @@ def _live(path: Path, tree: ast.Module, tests: list[str]) -> None:
         return usual(loader, name)
 
     importlib.machinery.SourceFileLoader.get_code = get_code  # type: ignore[method-assign]
-    os.chdir(HERE)
-    files = [f"tests/{name}.py" for name in tests if Path(f"tests/{name}.py").exists()]
-    code = 1
-    quiet = contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO())
-    with contextlib.suppress(BaseException), quiet[0], quiet[1]:
-        code = int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", *files]))
-    os._exit(code)
+    for name, module in list(sys.modules.items()):
+        if str(getattr(module, "__file__", None)).startswith((str(HERE / "src"), str(HERE / "tests"))):
+            del sys.modules[name]
 
 
 def main() -> None:
@@ -148,26 +229,50 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=0, help="of each module, drawn at random; 0 = all")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--among", type=Path, help="a former run's output")
     args = parser.parse_args()
     for path in ("src", "tests"):
         sys.path.insert(0, str(HERE / path))
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    os.chdir(HERE)
+    PIL.Image.init()
+    # a failing example need not be made smaller; the profiles of the tests start from this one
+    settings.register_profile("mutants", phases=[Phase.explicit, Phase.generate], database=None, deadline=None)
+    settings.load_profile("mutants")
+    former = set(args.among.read_text().splitlines()) if args.among else None
     total = dead = 0
     for module in args.modules:
-        path = HERE / "src/posekit" / f"{module}.py"
-        tree = ast.parse(path.read_text())
-        if killed(path, tree, MODULES[module], 600):
-            raise SystemExit(f"the tests of {module} fail without a mutant.")
-        every = mutants(path.read_text())
-        chosen = random.Random(args.seed).sample(every, min(args.count or len(every), len(every)))
-        lost = 0
-        for line, text, mutant in sorted(chosen, key=lambda m: m[0]):
-            if killed(path, mutant, MODULES[module], args.seconds):
-                lost += 1
-            else:
-                print(f"lives: {module}:{line}: {text}", flush=True)
+        chosen = _chosen(module, args.count, args.seed, former)
+        lost = _killed_of(module, chosen, args.seconds)
         total, dead = total + len(chosen), dead + lost
-        print(f"{module}: {lost} of {len(chosen)} killed ({len(every)} places)", flush=True)
+        print(f"{module}: {lost} of {len(chosen)} killed", flush=True)
     print(f"all: {dead} of {total} killed, {100 * dead / max(1, total):.0f} %")
+
+
+def _chosen(module: str, count: int, seed: int, former: set[str] | None) -> list[tuple[int, str, ast.Module]]:
+    every = mutants((HERE / "src/posekit" / f"{module}.py").read_text())
+    if former is not None:
+        every = [m for m in every if _told(module, m[0], m[1]) in former]
+    drawn = random.Random(seed).sample(every, min(count or len(every), len(every)))
+    return sorted(drawn, key=lambda m: m[0])
+
+
+def _killed_of(module: str, chosen: list[tuple[int, str, ast.Module]], seconds: float) -> int:
+    """How many of a module's mutants are killed, counted in a process of its own."""
+    receiver, sender = multiprocessing.Pipe(duplex=False)
+    child = os.fork()
+    if child == 0:
+        mutation = Mutation(module, chosen, seconds)
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(BaseException):
+            pytest.main(["-s", *_options(module)], plugins=[mutation])
+        sender.send(mutation.lost)
+        os._exit(0)
+    lost = receiver.recv()
+    os.waitpid(child, 0)
+    if lost is None:
+        raise SystemExit(f"the tests of {module} fail without a mutant.")
+    return int(lost)
 
 
 if __name__ == "__main__":

@@ -21,11 +21,11 @@ import torch
 from posekit.camera import Camera, mask_box
 from posekit.datasets.bop import BopDataset
 from posekit.estimate.refine import RefineOptions, refine
-from posekit.first_pose.hypotheses import MVNetSearch
+from posekit.first_pose.mvnet import MVNetSearch
 from posekit.geometry import Pose, random_rotation
 from posekit.mesh.model import ObjectModel
 from posekit.metrics import pose_error, within
-from posekit.nets.predictor import NetworkPredictor
+from posekit.nets.pytorch import NetworkPredictor
 from posekit.nets.weights import load_networks
 from posekit.render import Renderer
 from posekit.results import Detection

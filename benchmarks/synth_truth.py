@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from posekit.camera import mask_iou
 from posekit.datasets.bop import BopDataset
 from posekit.datasets.results_csv import ResultRow, results_csv
 from posekit.evaluate import evaluate
@@ -49,7 +50,7 @@ def overlaps(data: BopDataset) -> list[float]:
         for i in data.instances(scene, image, every=True):
             if i.visib_fract == 1.0 and (mask := i.mask()).sum() > LEAST:
                 [drawn] = renderer.render(data.model(i.obj_id), [i.T_cam_obj], camera, rgb=False, coords=False)
-                found.append(float((drawn.mask & mask).sum() / (drawn.mask | mask).sum()))
+                found.append(mask_iou(drawn.mask, mask))
     return found
 
 

@@ -1,10 +1,13 @@
-"""Meshes that tests make on the spot."""
+"""Meshes and a camera that many tests use."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from posekit.camera import Camera
 from posekit.mesh.model import ObjectModel
+
+CAMERA = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)  # off its axis, fx != fy
 
 
 def cuboid(low: tuple[float, float, float], high: tuple[float, float, float], cells: int = 1):  # type: ignore[no-untyped-def]

@@ -13,39 +13,26 @@ import pytest
 
 from posekit import Camera, EstimateOptions, PoseEstimator, Result, api, estimate
 from posekit.errors import ImageError, PromptError
-from posekit.nets.weights import build, save_networks
+from posekit.mesh.model import ObjectModel
 from posekit.render import Renderer
-from posekit.synth.example import Example, make_example, ply
+from posekit.synth.example import Example
 
 CAMERA = "610,610,322,236"
 
 
 @pytest.fixture(scope="module")
-def example() -> Example:
-    return make_example(Renderer())
-
-
-@pytest.fixture(scope="module")
-def folder(example: Example, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("api")
-    cv2.imwrite(str(folder / "photo.png"), example.view.image[..., ::-1])
-    (folder / "toy.ply").write_text(ply(example.model))
-    save_networks(folder / "untrained", build("lite"), {"trained on": "nothing"})
-    return folder
-
-
-@pytest.fixture(scope="module")
-def estimator(example: Example, folder: Path) -> PoseEstimator:
+def estimator(example: Example, example_folder: Path) -> PoseEstimator:
     options = EstimateOptions(hypotheses=1, iterations=1)
-    return PoseEstimator(example.model, weights=folder / "untrained", options=options)
+    model = ObjectModel.load(example_folder / "toy.ply", units="m")
+    return PoseEstimator(model, weights=example_folder / "untrained", options=options)
 
 
 @pytest.fixture(scope="module")
-def result(example: Example, folder: Path) -> Result:
+def result(example: Example, example_folder: Path) -> Result:
     options = EstimateOptions(hypotheses=1, iterations=1)
     return estimate(
-        folder / "photo.png", folder / "toy.ply", example.box, camera=CAMERA, units="m", weights=folder / "untrained",
-        options=options,
+        example_folder / "photo.png", example_folder / "toy.ply", example.box, camera=CAMERA, units="m",
+        weights=example_folder / "untrained", options=options,
     )  # fmt: skip
 
 

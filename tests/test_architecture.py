@@ -132,3 +132,27 @@ def test_no_rooms_for_odds_and_ends() -> None:
 
 def test_errors_know_nobody() -> None:
     assert not list(imports_of(SOURCE / "errors.py"))
+
+
+# Overrides of click's methods, and names that their class's docstring explains.
+SELF_EXPLANATORY = {
+    "Commands.parse_args", "Commands.invoke", "main", "Destination.chosen", "PoseEstimator.weights_hash",
+    "OpenVinoPredictor.predict",
+}  # fmt: skip
+
+
+def undocumented(scope: ast.Module | ast.ClassDef, prefix: str = "") -> Iterator[str]:
+    """Public classes, methods and functions without a docstring."""
+    for node in scope.body:
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+            if not ast.get_docstring(node):
+                yield prefix + node.name
+            if isinstance(node, ast.ClassDef):
+                yield from undocumented(node, f"{prefix}{node.name}.")
+
+
+@pytest.mark.parametrize("path", FILES, ids=relative)
+def test_public_names_have_docstrings(path: Path) -> None:
+    module = ast.parse(path.read_text(encoding="utf-8"), str(path))
+    assert ast.get_docstring(module) or not module.body, f"{relative(path)} has no docstring"
+    assert not set(undocumented(module)) - SELF_EXPLANATORY

@@ -350,3 +350,97 @@ def test_distortion_in_scene_camera_is_refused(root: Path) -> None:
     with pytest.raises(CameraError, match="image 3: its picture has lens distortion"):
         BopDataset(root).view(2, 3)
     assert BopDataset(root).view(2, 11).camera.fx == 511
+
+
+@pytest.mark.parametrize(("scale", "suffix"), [(1.0, ".png"), (0.1, ".png"), (0.1, ".tif"), (None, ".png")])
+def test_depth_is_in_metres_by_the_pictures_own_scale(scale: float | None, suffix: str, root: Path) -> None:
+    """A grey value times depth_scale is millimetres; without one a grey value is a millimetre."""
+    folder = root / "test" / "000002"
+    assert BopDataset(root).depth(2, 3) is None
+    raw = np.zeros((48, 64), np.uint16)
+    raw[10, 20], raw[30, 40] = 8000, 1
+    (folder / "depth").mkdir()
+    Image.fromarray(raw).save(folder / "depth" / f"000003{suffix}")
+    cameras = json.loads((folder / "scene_camera.json").read_text())
+    cameras["3"].pop("depth_scale")
+    if scale is not None:
+        cameras["3"]["depth_scale"] = scale
+    put(folder / "scene_camera.json", cameras)
+    depth = BopDataset(root).depth(2, 3)
+    assert depth is not None and depth.dtype == np.float32 and depth.shape == (48, 64)
+    assert depth[10, 20] == pytest.approx(8.0 * (scale or 1.0)) and depth[30, 40] == pytest.approx(
+        1e-3 * (scale or 1.0)
+    )
+    assert np.count_nonzero(depth) == 2
+
+
+def test_damaged_depth_is_told(root: Path) -> None:
+    folder = root / "test" / "000002"
+    (folder / "depth").mkdir()
+    Image.new("RGB", (64, 48)).save(folder / "depth" / "000003.png")
+    with pytest.raises(ImageError, match="damaged or has several channels"):
+        BopDataset(root).depth(2, 3)
+    (folder / "depth" / "000003.png").write_bytes(b"x")
+    with pytest.raises(ImageError, match="damaged or has several channels"):
+        BopDataset(root).depth(2, 3)
+    Image.new("I;16", (64, 48)).save(folder / "depth" / "000003.png")
+    cameras = json.loads((folder / "scene_camera.json").read_text())
+    cameras["3"]["depth_scale"] = "x"
+    put(folder / "scene_camera.json", cameras)
+    with pytest.raises(InputError, match="image 3: its depth_scale is no number"):
+        BopDataset(root).depth(2, 3)
+
+
+def test_a_pictures_size_is_read_from_its_header(root: Path) -> None:
+    assert BopDataset(root).picture_size(2, 3) == (64, 48)
+    (root / "test" / "000002" / "rgb" / "000003.png").write_bytes(b"x")
+    with pytest.raises(ImageError, match="is damaged"):
+        BopDataset(root).picture_size(2, 3)
+
+
+def test_a_stated_diameter_is_in_millimetres(root: Path) -> None:
+    """Taken where it is that of the mesh, to a twentieth, in mm."""
+    measured = BopDataset(root).model(5).diameter
+    for stated in (1000 * measured * 1.04, 1000 * measured * 0.96, 1000 * measured * 1.2):
+        put(root / "models" / "models_info.json", {"5": {"diameter": stated}})
+        assert BopDataset(root).measured_model(5).diameter == pytest.approx(stated / 1000)
+    for bad in (0, -3, "x", float("inf"), None):
+        put(root / "models" / "models_info.json", {"5": {"diameter": bad}})
+        with pytest.raises(InputError, match="it is a number of mm"):
+            BopDataset(root).measured_model(5)
+    put(root / "models" / "models_info.json", {"9": {"diameter": 5}})
+    assert BopDataset(root).measured_model(5).diameter == pytest.approx(measured)
+
+
+def test_the_fine_models_measure_where_there_are_some(root: Path) -> None:
+    (root / "models_eval").mkdir()
+    trimesh.creation.box((50, 60, 40)).export(root / "models_eval" / "obj_000005.ply")
+    put(root / "models_eval" / "models_info.json", {"5": {"diameter": 90.0}})
+    data = BopDataset(root)
+    assert data.measured_model(5).diameter == pytest.approx(0.09)
+    np.testing.assert_allclose(data.measured_model(5).model.extents, [0.05, 0.06, 0.04], atol=1e-6)
+    assert data.measured_model(5) is data.measured_model(5) and data.measured_model(9).model is data.model(9)
+
+
+def test_boxes_are_none_by_their_size_alone(root: Path) -> None:
+    path = root / "test" / "000002" / "scene_gt_info.json"
+    info = json.loads(path.read_text())
+    for k, box in enumerate(([-5, -7, 0, 0], [3, 4, -1, 5], [3, 4, 5, -1])):
+        info["3"][k]["bbox_obj"] = box
+    put(path, info)
+    assert [i.box_obj for i in BopDataset(root).instances(2, 3)] == [(-5, -7, -4, -6), None, None]
+
+
+@pytest.mark.parametrize(("far", "known"), [(9.9, False), (10.1, True)])
+def test_poses_nearer_than_a_centimetre_are_taken_for_metres(far: float, known: bool, root: Path) -> None:
+    path = root / "test" / "000002" / "scene_gt.json"
+    truth = json.loads(path.read_text())
+    for entries in truth.values():
+        for k, entry in enumerate(entries):
+            entry["cam_t_m2c"] = [0.6 * far, 0.0, 0.8 * far] if k else [0, 0, 1]
+    put(path, truth)
+    if known:
+        assert len(BopDataset(root).instances(2, 3)) == 3
+    else:
+        with pytest.raises(InputError, match="seems to be in metres"):
+            BopDataset(root).instances(2, 3)

@@ -26,7 +26,7 @@ from posekit.camera import Camera
 from posekit.cli.prompts import prompt_for
 from posekit.errors import CameraError
 from posekit.io.calibration import load_calibration
-from posekit.io.load import load_camera, load_view
+from posekit.io.load import load_view
 from posekit.lens import Lens
 from posekit.view import View
 
@@ -143,38 +143,33 @@ def test_fisheye(model: str, tmp_path: Path) -> None:
 )  # fmt: skip
 def test_cameras_of_half_the_size_are_scaled(size: dict[str, Any], tmp_path: Path) -> None:
     half = {"K": [[286.0, 0, 162.0], [0, 287.0, 120.5], [0, 0, 1]]} | size
-    camera = load_camera(given(tmp_path, half), VGA)
+    camera = load_calibration(given(tmp_path, half), VGA).camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((572, 574, 324.5, 241.5))
     with pytest.raises(CameraError, match="which is another shape"):
-        load_camera(tmp_path / "c.json", (640, 400))
+        load_calibration(tmp_path / "c.json", (640, 400))
 
 
 @pytest.mark.parametrize("size", [{"width": 320}, {"resolution": [1, 2, 3, 4]}, {"size": [0.5, 0.5]}])
 def test_sizes_that_cannot_be_read_are_refused(size: dict[str, Any], tmp_path: Path) -> None:
     with pytest.raises(CameraError, match=r"size|width or a height"):
-        load_camera(given(tmp_path, NUMBERS | size), VGA)
+        load_calibration(given(tmp_path, NUMBERS | size), VGA)
 
 
 @pytest.mark.parametrize("share", [0.5, 1.25, 2.0])
 def test_a_principal_point_far_from_the_middle_is_told(share: float, caplog: pytest.LogCaptureFixture) -> None:
-    load_camera(f"{FX * share},{FY * share},{320 * share},{240 * share}", VGA)
+    load_calibration(f"{FX * share},{FY * share},{320 * share},{240 * share}", VGA)
     assert "is the camera of another picture size?" in caplog.text
 
 
 def test_columns_first(tmp_path: Path) -> None:
     by_columns = np.transpose(ROWS).ravel().tolist()
-    np.testing.assert_allclose(load_camera(given(tmp_path, {"intrinsic_matrix": by_columns}), VGA).K, ROWS)
+    np.testing.assert_allclose(load_calibration(given(tmp_path, {"intrinsic_matrix": by_columns}), VGA).camera.K, ROWS)
 
 
 def test_two_cameras_in_a_file(tmp_path: Path) -> None:
     two = {"left": NUMBERS, "right": NUMBERS | {"fx": 600}}
     with pytest.raises(CameraError, match="several cameras"):
-        load_camera(given(tmp_path, two), VGA)
-
-
-def test_a_camera_alone_has_no_lens(tmp_path: Path) -> None:
-    with pytest.raises(CameraError, match=r"has lens distortion .*load_view"):
-        load_camera(given(tmp_path, NUMBERS | {"D": BENT}), VGA)
+        load_calibration(given(tmp_path, two), VGA)
 
 
 # --- lenses ---

@@ -28,9 +28,8 @@ from posekit.cli.app import app
 from posekit.cli.output import limits
 from posekit.geometry import Pose, rotation_angle
 from posekit.io.load import load_pose
-from posekit.nets.weights import build, save_networks
 from posekit.render import Renderer
-from posekit.synth.example import Example, make_example, ply
+from posekit.synth.example import Example, ply
 
 Invoke = Callable[..., Result]
 
@@ -92,22 +91,12 @@ def test_version() -> None:
 
 
 @pytest.fixture(scope="module")
-def example() -> Example:
-    return make_example(Renderer())
-
-
-@pytest.fixture(scope="module")
-def folder(example: Example, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Input files, and weights that nobody trained."""
-    folder = tmp_path_factory.mktemp("input")
-    cv2.imwrite(str(folder / "photo.png"), example.view.image[..., ::-1])
-    (folder / "toy.ply").write_text(ply(example.model))
-    (folder / "pose.json").write_text(json.dumps({"T_cam_obj": example.T_cam_obj.matrix.tolist()}))
+def folder(example_folder: Path) -> Path:
+    """The example's files and a mask."""
     mask = np.zeros((480, 640), np.uint8)
     mask[150:290, 260:450] = 255
-    cv2.imwrite(str(folder / "mask.png"), mask)
-    save_networks(folder / "untrained", build("lite"), {"trained on": "nothing"})
-    return folder
+    cv2.imwrite(str(example_folder / "mask.png"), mask)
+    return example_folder
 
 
 CAMERA = "610,610,322,236"

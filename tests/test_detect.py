@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from objects import bracket
-from posekit.camera import Camera
+from posekit.camera import Camera, box_mask
 from posekit.detect import BoxPrompt, Detector, MaskPrompt
-from posekit.detect.prompts import clip_box, filled_mask, grabcut_mask
+from posekit.detect.prompts import clip_box, grabcut_mask
 from posekit.detect.sharpen import sharpened
 from posekit.errors import PromptError
 from posekit.results import Detection
@@ -54,7 +54,7 @@ def test_a_mask_that_cannot_be_right_is_refused() -> None:
     flat = View(np.full((150, 200, 3), 128, np.uint8), CAMERA)
     [detection] = BoxPrompt(BOX, "grabcut").detect(flat, [bracket()])
     assert detection.source == "box+filled"
-    np.testing.assert_array_equal(detection.mask, filled_mask(BOX, CAMERA))
+    np.testing.assert_array_equal(detection.mask, box_mask(BOX, CAMERA.size))
 
 
 def test_a_box_of_the_whole_picture() -> None:
@@ -72,12 +72,21 @@ def test_tiny_boxes_have_a_mask(box: tuple[float, float, float, float]) -> None:
     assert detection.mask.any()
 
 
-def test_filled_mask_covers_the_edges() -> None:
-    mask = filled_mask((0, 0, 200, 150), CAMERA)
+def test_a_filled_box_covers_the_edges() -> None:
+    mask = box_mask((0, 0, 200, 150), CAMERA.size)
     assert mask.all()
-    mask = filled_mask((10, 20, 13, 22), CAMERA)
+    mask = box_mask((10, 20, 13, 22), CAMERA.size)
     assert mask.sum() == 6
     assert mask[20:22, 10:13].all()
+
+
+@pytest.mark.parametrize(
+    ("box", "pixels"),
+    [((-5, -5, 3, 2), 6), ((198.2, 149.4, 300, 300), 2), ((50.2, 60.2, 50.4, 60.4), 1), ((-9, 0, -1, 9), 0),
+     ((200, 0, 210, 9), 0)],
+)  # fmt: skip
+def test_a_filled_box_keeps_to_the_picture(box: tuple[float, float, float, float], pixels: int) -> None:
+    assert box_mask(box, CAMERA.size).sum() == pixels
 
 
 def test_filled_on_request() -> None:

@@ -18,10 +18,10 @@ import torch
 from typer.testing import CliRunner
 
 from objects import bracket
-from posekit.camera import Camera, mask_box
+from posekit.camera import Camera, box_iou, mask_box
 from posekit.cli.app import app
 from posekit.detect import maskrcnn
-from posekit.detect.coco import Truth, average_precision
+from posekit.detect.coco import Overlaps, Truth, average_precision, average_precision_of_overlaps
 from posekit.detect.external import DetectionsFile, categories_of, to_bop, to_coco
 from posekit.detect.maskrcnn import (
     SHIPPED,
@@ -53,11 +53,6 @@ TINY = MaskRCNNConfig(size=(128, 96), use_size=(128, 96), channels=16, hidden=32
 SCENES = TabletopStreamConfig(
     batch=2, pool=4, per_block=2, reuse=2, meshes=2, scenes=TabletopConfig(size=(128, 96), distractors=(1, 2))
 )
-
-
-@pytest.fixture(scope="module")
-def renderer() -> Renderer:
-    return Renderer()
 
 
 @pytest.fixture(scope="module")
@@ -265,6 +260,55 @@ def test_average_precision_of_what_can_be_counted() -> None:
     assert average_precision([nobody], [_found([truth.masks[0]], [0.9])])["box_ap50"] == pytest.approx(1.0)
 
 
+def test_average_precision_of_known_overlaps_is_that_of_boxes() -> None:
+    from contextlib import redirect_stdout
+    from io import StringIO
+
+    from pycocotools.coco import COCO
+    from pycocotools.cocoeval import COCOeval
+
+    rng = np.random.default_rng(3)
+    annotations, results, pictures = [], [], []
+    for image in range(12):
+        true = [np.r_[xy, xy + rng.uniform(10, 40, 2)] for xy in rng.uniform(0, 100, (rng.integers(0, 5), 2))]
+        found = [t + rng.normal(0, 3, 4) for t in true for _ in range(rng.integers(0, 3))]
+        found += [np.r_[xy, xy + 20] for xy in rng.uniform(0, 100, (2, 2))]
+        scores = rng.random(len(found))
+        for t in true:
+            annotations.append({"id": len(annotations) + 1, "image_id": image, "category_id": 1, "iscrowd": 0,
+                                "bbox": [*t[:2], *(t[2:] - t[:2])], "area": float(np.prod(t[2:] - t[:2]))})  # fmt: skip
+        for f, s in zip(found, scores, strict=True):
+            results.append({"image_id": image, "category_id": 1, "bbox": [*f[:2], *(f[2:] - f[:2])], "score": s})
+        pictures.append((true, found, scores))
+    with redirect_stdout(StringIO()):
+        coco = COCO()
+        coco.dataset = {"images": [{"id": k} for k in range(12)], "annotations": annotations,
+                        "categories": [{"id": 1}], "info": {}}  # fmt: skip
+        coco.createIndex()
+        coco_eval = COCOeval(coco, coco.loadRes(results), "bbox")
+        coco_eval.evaluate()
+        coco_eval.accumulate()
+        coco_eval.summarize()
+    overlaps = [
+        Overlaps(s, np.zeros(len(t), bool), box_iou(np.reshape(f, (-1, 1, 4)), np.reshape(t, (1, -1, 4))))
+        for t, f, s in pictures
+    ]
+    assert 0.1 < coco_eval.stats[0] < 0.9
+    assert average_precision_of_overlaps(overlaps) == pytest.approx(coco_eval.stats[:2], abs=1e-9)
+
+
+def test_ignored_instances_are_neither_asked_for_nor_held_against_anyone() -> None:
+    def ap50(iou: list[list[float]], ignored: list[bool]) -> float:
+        return average_precision_of_overlaps([Overlaps(np.array([0.9, 0.8]), np.array(ignored), np.array(iou))])[1]
+
+    assert ap50([[0.0, 1.0], [1.0, 0.0]], [False, True]) == pytest.approx(1.0)
+    assert ap50([[0.0, 0.0], [1.0, 0.0]], [False, True]) == pytest.approx(0.5)
+    # an ignored instance excuses one detection, the best-scored one
+    assert ap50([[0.0, 1.0], [0.0, 1.0]], [False, True]) == 0.0
+    assert np.isnan(ap50([[0.0], [0.0]], [True]))
+    assert average_precision_of_overlaps([Overlaps(np.zeros(0), np.array([False]), np.zeros((0, 1)))]) == (0.0, 0.0)
+
+
 def test_masks_and_detections_survive_their_files(tmp_path: Path) -> None:
     mask = np.random.default_rng(0).random((60, 80)) < 0.3
     np.testing.assert_array_equal(decode(json.loads(json.dumps(encode(mask))), (80, 60)), mask)
@@ -425,21 +469,21 @@ def test_proposals_are_compared_with_the_mesh(renderer: Renderer, untrained: Tra
         NovelDetector(TrainedDetector(dataclasses.replace(TINY, classes=("cup",)), untrained.network), renderer)
 
 
-def test_looks_in_two_sizes_are_joined(untrained: TrainedDetector, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_detections_in_two_sizes_are_joined(untrained: TrainedDetector, monkeypatch: pytest.MonkeyPatch) -> None:
     masks = np.zeros((3, 60, 80), bool)
     masks[:, 5:20, 5:20] = True
-    looks = iter(
+    outputs = iter(
         [
             Found(np.array([[4.0, 4, 20, 20], [40, 30, 60, 50]]), np.array([0, 0]), np.array([0.9, 0.4]), masks[:2]),
             Found(np.array([[6.0, 4, 22, 20], [4.0, 4, 20, 20]]), np.array([0, 1]), np.array([0.3, 0.2]), masks[:2]),
         ]
     )
-    monkeypatch.setattr(maskrcnn, "find", lambda *_, **__: next(looks))
+    monkeypatch.setattr(maskrcnn, "find", lambda *_, **__: next(outputs))
     image = np.zeros((60, 80, 3), np.uint8)
     found = maskrcnn.find_augmented(untrained, image, ((1.0, False), (2.0, False)), min_score=0.15)
     assert found.scores.tolist() == pytest.approx([0.6, 0.2]) and found.labels.tolist() == [0, 0]
     np.testing.assert_allclose(found.boxes, [[4.5, 4, 20.5, 20], [40, 30, 60, 50]], atol=1e-4)
-    looks = iter([Found(np.zeros((0, 4)), np.zeros(0, np.int64), np.zeros(0), masks[:0])] * 2)
+    outputs = iter([Found(np.zeros((0, 4)), np.zeros(0, np.int64), np.zeros(0), masks[:0])] * 2)
     assert not len(maskrcnn.find_augmented(untrained, image, ((1.0, False), (2.0, False)), min_score=0.15).scores)
 
 
@@ -471,7 +515,9 @@ def test_what_looks_like_the_mesh_counts_for_more(renderer: Renderer) -> None:
     assert [d.box for d in finder.detect(view, [model])] == [boxes[0]]
 
 
-def test_a_mirrored_look_is_mirrored_back(untrained: TrainedDetector, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_mirrored_picture_shows_is_mirrored_back(
+    untrained: TrainedDetector, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What stands for the network finds the picture's bright part."""
 
     def bright(_: object, image: np.ndarray, **__: object) -> Found:
@@ -483,11 +529,11 @@ def test_a_mirrored_look_is_mirrored_back(untrained: TrainedDetector, monkeypatc
     monkeypatch.setattr(maskrcnn, "find", bright)
     image = np.zeros((60, 80, 3), np.uint8)
     image[10:30, 5:25] = 200
-    for looks in (((1.0, True),), ((1.0, False), (1.5, True))):
-        found = maskrcnn.find_augmented(untrained, image, looks, min_score=0.5)
+    for augmentations in (((1.0, True),), ((1.0, False), (1.5, True))):
+        found = maskrcnn.find_augmented(untrained, image, augmentations, min_score=0.5)
         np.testing.assert_allclose(found.boxes, [[5, 10, 25, 30]], atol=1e-4)
         np.testing.assert_array_equal(found.masks[0], image[..., 0] > 100)
-        assert found.scores.tolist() == pytest.approx([0.8]), "one instance, seen by every look"
+        assert found.scores.tolist() == pytest.approx([0.8]), "one instance, found in every version"
 
 
 # --- commands -----------------------------------------------------------------------------------------------------

@@ -10,23 +10,21 @@ import pytest
 import torch
 
 from bop_scene import brick
-from objects import bracket
-from posekit.camera import Camera
+from objects import CAMERA, bracket
 from posekit.estimate.estimator import EstimateOptions, PoseEstimator
 from posekit.first_pose.hypotheses import BoxSearch, TemplateSearch
 from posekit.geometry import Pose, rotation_angle, so3_exp, view_rotation
 from posekit.mesh.model import ObjectModel
 from posekit.mesh.symmetries import Symmetries
 from posekit.metrics import pose_error
+from posekit.nets.config import PaperConfig
 from posekit.nets.paper import PaperSVNet
-from posekit.nets.weights import Networks, PaperConfig, build, save_networks
+from posekit.nets.weights import Networks, build, save_networks
 from posekit.render import Renderer
 from posekit.results import Branch, Detection, Estimate, Source
 from posekit.tracking.tracker import LOST, RESTARTED, Tracker
 from posekit.view import View
 from test_refine import Oracle
-
-CAMERA = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
 
 
 @pytest.fixture(scope="module")
@@ -161,7 +159,7 @@ def test_a_tracked_pose_stays_on_its_branch() -> None:
     assert first.estimate.converged and first.estimate.angle < 0.02, "as the network says"
     second = tracker.step(shown)
     assert second.estimate is not None and second.estimate.branch is Branch.LAST
-    tracker._lose()
+    tracker._reset()
     tracker.detector = None
     assert tracker.step(empty).state == LOST
     tracker.detector = Finding()  # type: ignore[assignment]

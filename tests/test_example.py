@@ -19,16 +19,6 @@ from posekit.view import View
 from posekit.visualise import draw, figures
 
 
-@pytest.fixture(scope="module")
-def renderer() -> Renderer:
-    return Renderer()
-
-
-@pytest.fixture(scope="module")
-def example(renderer: Renderer) -> Example:
-    return make_example(renderer)
-
-
 def test_the_locomotive_is_a_toy_of_sensible_size() -> None:
     model = locomotive()
     assert 0.15 < model.diameter < 0.25

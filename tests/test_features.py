@@ -9,17 +9,14 @@ import cv2
 import numpy as np
 import pytest
 
-from objects import bracket, cuboid
-from posekit.camera import Camera
+from objects import CAMERA, bracket, cuboid
 from posekit.detect.novel import make_detector
-from posekit.first_pose import features
-from posekit.first_pose.features import FeatureModel, FeatureSearch, cache_file
+from posekit.first_pose import features, mesh_cache
+from posekit.first_pose.features import VERSION, FeatureModel, FeatureSearch
 from posekit.geometry import Pose, random_rotation, rotation_angle
 from posekit.mesh.model import ObjectModel
 from posekit.render import Light, Renderer
 from posekit.view import View
-
-CAMERA = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -27,11 +24,6 @@ def cache(tmp_path_factory: pytest.TempPathFactory):  # type: ignore[no-untyped-
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         yield
-
-
-@pytest.fixture(scope="module")
-def renderer() -> Renderer:
-    return Renderer()
 
 
 def textured(seed: int = 0) -> ObjectModel:
@@ -161,9 +153,9 @@ def test_another_texture_has_another_file_and_a_damaged_one_is_made_anew(
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     model = textured()
-    path = cache_file(model)
-    assert path != cache_file(textured(1))
-    assert cache_file(model) == cache_file(textured())
+    path = mesh_cache.cache_file("features", model, VERSION)
+    assert path != mesh_cache.cache_file("features", textured(1), VERSION)
+    assert mesh_cache.cache_file("features", model, VERSION) == mesh_cache.cache_file("features", textured(), VERSION)
     assert tmp_path in path.parents
     path.parent.mkdir(parents=True)
     path.write_bytes(b"no archive")
@@ -173,11 +165,14 @@ def test_another_texture_has_another_file_and_a_damaged_one_is_made_anew(
 
 def test_the_oldest_files_make_room(renderer: Renderer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(features, "KEPT", 2)
+    monkeypatch.setattr(mesh_cache, "KEPT", 2)
     for seed in range(3):
         FeatureModel.of(textured(seed), renderer)
-    left = set(cache_file(textured()).parent.glob("*.npz"))
-    assert left == {cache_file(textured(1)), cache_file(textured(2))}
+    left = set(mesh_cache.cache_file("features", textured(), VERSION).parent.glob("*.npz"))
+    assert left == {
+        mesh_cache.cache_file("features", textured(1), VERSION),
+        mesh_cache.cache_file("features", textured(2), VERSION),
+    }
 
 
 def test_coloured_vertices_alone_give_nothing_false(renderer: Renderer) -> None:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from conftest import differences, moved
-from posekit.align.gauss_newton import GaussianPose, Lines, Points, fuse
+from posekit.align.gauss_newton import GaussianPose, Lines, Points, Solution, cauchy, fuse, geman_mcclure, solve
 from posekit.align.mask_edge import MaskEdgeConfig, _Crop, _equations
 from posekit.camera import Camera
 from posekit.geometry import Pose, so3_exp, so3_log
@@ -85,6 +85,127 @@ def test_a_belief_pulls_towards_its_pose_and_turns_with_its_axes() -> None:
 def test_fusing_leaves_no_point_behind_the_camera() -> None:
     near = GaussianPose.about(Pose(POSE.R, np.array([0.0, 0.0, 5e-4])), CAMERA, 0.1, 1.0, 0.1)
     assert fuse(POSE, [near], CAMERA) is None
+
+
+# --- the solver ------------------------------------------------------------------------------------------------------
+
+
+def scripted(*rights: object, start: Pose = POSE, **options: float) -> tuple[Solution | None, int]:
+    """What `solve` makes of given steps (None: no equations), and how many of them it takes."""
+    size, calls = 6 + int(options.get("extra", 0)), []
+
+    def equations(pose: Pose, more: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        right = rights[len(calls)]
+        calls.append(pose)
+        return None if right is None else (np.diag(np.arange(1.0, size + 1)), np.array(right) * np.arange(1, size + 1))
+
+    found = solve(start, equations, **{"steps": len(rights), "still": 1e-3, **options})  # type: ignore[arg-type]
+    return found, len(calls)
+
+
+def test_steps_add_up_and_unknowns_beside_the_pose_too() -> None:
+    first, second = np.array([0.1, -0.2, 0.3, 0.01, 0.02, -0.03, 0.5, -2.0]), np.full(8, 0.05)
+    found, _ = scripted(first, second, extra=2)
+    assert found is not None
+    np.testing.assert_allclose(found.pose.matrix, moved(moved(POSE, first), second).matrix, atol=1e-12)
+    np.testing.assert_allclose(found.extra, [0.55, -1.95])
+    np.testing.assert_allclose(found.normal, np.diag(np.arange(1.0, 9)))
+    none, _ = scripted(extra=2)
+    assert none is not None and none.extra.tolist() == [0, 0]
+    np.testing.assert_array_equal(none.normal, np.eye(8))
+    plain, _ = scripted(np.full(6, 0.05))
+    assert plain is not None and plain.extra.shape == (0,)
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+@pytest.mark.parametrize("k", range(6))
+def test_the_loop_ends_when_turn_and_shift_are_still(k: int, sign: float) -> None:
+    """The shift in shares of the distance, here 0.6 m."""
+    limit = sign * 1e-3 * (1.0 if k < 3 else POSE.t[2])
+    assert scripted(0.98 * limit * np.eye(6)[k], np.zeros(6), np.zeros(6))[1] == 1
+    assert scripted(1.02 * limit * np.eye(6)[k], np.zeros(6), np.zeros(6))[1] == 2
+
+
+def test_the_turn_that_ends_the_loop_does_not_depend_on_the_distance() -> None:
+    far = Pose(POSE.R, np.array([0.1, 0.2, 3.0]))
+    for right, calls in (([1.1e-3, 0, 0, 0, 0, 0], 2), ([0, 0, 0, 2.8e-3, 0, 0], 1), ([0, 0, 0, 0, 3.2e-3, 0], 2)):
+        assert scripted(right, np.zeros(6), np.zeros(6), start=far)[1] == calls
+
+
+def test_a_lines_side_does_not_matter() -> None:
+    """Also where all residuals are large: then their median widens the knee."""
+    for shift in (-20.0, 20.0):
+        one = Lines(POINTS, PIXELS + shift * NORMALS, NORMALS, SIGMA)
+        for a, b in zip(
+            one.equations(POSE, CAMERA), replace(one, normals=-NORMALS).equations(POSE, CAMERA), strict=True
+        ):
+            np.testing.assert_allclose(a, b, rtol=1e-9)
+
+
+@pytest.mark.parametrize("right", [None, [0, 0, 0, 0, 0, -0.5995], [0, 0, 0, np.nan, 0, 0], [0, 0, 0, 0, 0, -5]])
+def test_a_pose_that_cannot_be_ends_the_loop(right: object) -> None:
+    found, calls = scripted(right, np.full(6, 0.01))
+    assert found is None and calls == 1
+
+
+def test_a_pose_may_come_as_near_as_is_said() -> None:
+    towards = [0, 0, 0, 0, 0, -0.3]
+    assert scripted(towards)[0] is not None
+    assert scripted(towards, nearest=0.31)[0] is None and scripted(towards, nearest=0.29)[0] is not None
+    assert scripted([0, 0, 0, 0, 0, -0.5985])[0] is not None, "1.5 mm before the camera"
+
+
+def test_rotations_stay_rotations() -> None:
+    found, _ = scripted(*[np.full(6, 0.01)] * 9, start=Pose(POSE.R * 1.001, POSE.t))
+    assert found is not None
+    np.testing.assert_allclose(found.pose.R @ found.pose.R.T, np.eye(3), atol=1e-12)
+
+
+@pytest.mark.parametrize(("weights", "at_knee", "twice"), [(geman_mcclure, 1 / 4, 1 / 25), (cauchy, 1 / 2, 1 / 5)])
+def test_robust_weights_by_size(weights, at_knee: float, twice: float) -> None:  # type: ignore[no-untyped-def]
+    np.testing.assert_allclose(weights(np.array([0.0, 0.1, 0.2, 3.0, 6.0]), 3.0)[[0, 3, 4]], [1, at_knee, twice])
+    far = np.array([0.0, 10.0, 20.0, 30.0, 60.0])  # 20 in the middle: the knee is 30
+    np.testing.assert_allclose(weights(far, 3.0)[[0, 3, 4]], [1, at_knee, twice])
+    even = weights(np.array([40.0, 0.0, 20.0, 10.0]), 3.0)  # the upper one of the two middle ones: 20
+    assert even[2] == pytest.approx(1 / (1 + (2 / 3) ** 2) ** round(np.log2(1 / at_knee)))
+    assert weights(np.zeros(0), 3.0).shape == (0,)
+
+
+def test_points_behind_the_camera_are_brought_before_it() -> None:
+    points, near = POINTS.copy(), POINTS.copy()
+    points[3], near[3] = POSE.inverse().apply([[0.02, 0.01, -0.2], [0.02, 0.01, 1e-3]])
+    for term in (Points(points, PIXELS, WEIGHT, SIGMA), Lines(points, PIXELS, NORMALS, SIGMA)):
+        behind, before = term.equations(POSE, CAMERA), replace(term, points=near).equations(POSE, CAMERA)
+        for a, b in zip(behind, before, strict=True):  # by the turn they differ: the arm is another one
+            np.testing.assert_allclose(a[3:][..., -3:], b[3:][..., -3:], rtol=1e-6)
+
+
+def test_fusing_takes_few_steps_and_weighs_by_certainty() -> None:
+    step = np.array([0.02, -0.01, 0.03, 0.002, 0.003, -0.004])
+    one = GaussianPose.about(POSE, CAMERA, 0.1, 5.0, 0.02)
+    two = replace(one, pose=moved(POSE, step))
+    found = fuse(POSE, [one, two], CAMERA)
+    assert found is not None
+    np.testing.assert_allclose(found.pose.matrix, moved(POSE, step / 2).matrix, atol=1e-5)
+    np.testing.assert_allclose(found.information, one.information + two.information)
+    for size, wanted in ((0.01, 6), (4.5e-4 * POSE.t[2], 1), (5.5e-4, 6)):
+        restless = Restless(size)
+        assert fuse(POSE, [restless], CAMERA) is not None
+        assert restless.calls == wanted
+
+
+class Restless:
+    """Always asks for another step of a size."""
+
+    def __init__(self, size: float) -> None:
+        self.size, self.calls = size, 0
+
+    def equations(self, pose: Pose, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+        self.calls += 1
+        return np.eye(6), np.full(6, self.size)
+
+
+# --- the mask's edge -------------------------------------------------------------------------------------------------
 
 
 def test_the_contours_equations_are_least_squares_with_a_prior() -> None:

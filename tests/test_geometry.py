@@ -1,19 +1,20 @@
-"""Poses form a group, cameras invert themselves, a zoom may come before or after the projection."""
+"""Poses form a group, rotations have several forms, views lie all round."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
-from posekit.camera import Camera, Zoom, mask_box
-from posekit.errors import CameraError
+from conftest import points
 from posekit.geometry import (
     Pose,
     PoseNoise,
     cube_views,
+    euler_xyz,
     fibonacci_sphere,
+    nearest_rotation,
     quat_to_rotation,
     random_rotation,
     rotation_angle,
@@ -23,22 +24,11 @@ from posekit.geometry import (
     so3_log,
     view_rotation,
 )
-from posekit.view import View
-
-settings.register_profile("posekit", deadline=None, max_examples=60, derandomize=True)
-settings.load_profile("posekit")
 
 unit = st.tuples(*[st.floats(-1, 1)] * 3).map(np.array).filter(lambda v: np.linalg.norm(v) > 0.1)
 sizes = st.one_of(st.floats(0, np.pi - 1e-3), st.floats(1e-9, 1e-6))  # radians; near the identity too
 turns = st.builds(lambda axis, angle: axis / np.linalg.norm(axis) * angle, unit, sizes)
 poses = st.builds(lambda w, t: Pose(so3_exp(w), t), turns, st.tuples(*[st.floats(-2, 2)] * 3).map(np.array))
-cameras = st.builds(
-    lambda f, stretch, cx, cy: Camera(f, f * stretch, cx, cy, 640, 480),
-    st.floats(200, 2000), st.floats(0.8, 1.25), st.floats(200, 440), st.floats(150, 330),
-)  # fmt: skip
-points = st.lists(st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(0.4, 3)), min_size=1, max_size=8).map(
-    np.array
-)
 
 
 def same(a: Pose, b: Pose, tolerance: float = 1e-9) -> bool:
@@ -153,102 +143,51 @@ def test_views_over_the_sphere_look_at_the_origin() -> None:
         np.testing.assert_allclose(view_rotation(d) @ -d, [0, 0, 1], atol=1e-12)
 
 
-# --- cameras ---
+def test_views_are_spread_by_the_golden_angle() -> None:
+    np.testing.assert_allclose(fibonacci_sphere(4)[:, 2], [0.75, 0.25, -0.25, -0.75])
+    views = fibonacci_sphere(300)
+    azimuth = np.unwrap(np.arctan2(views[:, 1], views[:, 0]))
+    np.testing.assert_allclose(np.mod(np.diff(azimuth), 2 * np.pi), np.pi * (5**0.5 - 1), atol=1e-9)
+    apart = np.sort(np.arccos(np.clip(views @ views.T, -1, 1)), axis=1)[:, 1]
+    assert apart.min() > 0.7 * np.sqrt(4 * np.pi / 300), "none is much nearer to another than all are"
 
 
-@given(cameras, points)
-def test_projection_and_back(camera: Camera, p: np.ndarray) -> None:
-    np.testing.assert_allclose(camera.backproject(camera.project(p), p[:, 2]), p, atol=1e-9)
-    homogeneous = p @ camera.K.T
-    np.testing.assert_allclose(camera.project(p), homogeneous[:, :2] / homogeneous[:, 2:], atol=1e-9)
+def test_z_is_up_in_a_view_but_from_above_and_below() -> None:
+    np.testing.assert_allclose(view_rotation([0, 0, 2]), [[1, 0, 0], [0, -1, 0], [0, 0, -1]], atol=1e-12)
+    np.testing.assert_allclose(view_rotation([0, 0, -2]), [[-1, 0, 0], [0, -1, 0], [0, 0, 1]], atol=1e-12)
+    for high, axis in ((0.9985, 2), (-0.9985, 2), (0.9995, 1), (-0.9995, 1)):
+        R = view_rotation([0.6 * np.sqrt(1 - high**2), 0.8 * np.sqrt(1 - high**2), high])
+        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+        assert R[0, axis] == pytest.approx(0) and abs(R[0, 3 - axis]) > 1e-3, "that axis has no part to the right"
+        assert R[1, axis] < 0, "and points up"
 
 
-@given(cameras, points, st.integers(100, 2000), st.integers(100, 2000))
-def test_resizing_moves_edges_with_the_picture(camera: Camera, p: np.ndarray, width: int, height: int) -> None:
-    edge, resized = camera.project(p) + 0.5, camera.resized(width, height)
-    np.testing.assert_allclose(resized.project(p) + 0.5, edge * (width / 640, height / 480), atol=1e-6)
+def test_euler_angles_turn_about_x_first() -> None:
+    a, b, c = 0.3, -0.5, 0.8
+    Rx = [[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]]
+    Ry = [[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]]
+    Rz = [[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]]
+    np.testing.assert_allclose(euler_xyz([a, b, c]), np.array(Rz) @ Ry @ Rx, atol=1e-12)
 
 
-@given(cameras, points)
-def test_cropping_shifts(camera: Camera, p: np.ndarray) -> None:
-    np.testing.assert_allclose(camera.cropped(30, 40, 200, 100).project(p), camera.project(p) - (30, 40), atol=1e-9)
+def test_a_matrix_is_a_rotation_to_a_thousandth() -> None:
+    matrix = np.eye(4)
+    matrix[:3, 3] = 1, 2, 3
+    matrix[:3, :3] = 1.0004 * so3_exp([0.1, 0.2, 0.3])
+    np.testing.assert_allclose(Pose.from_matrix(matrix).R, so3_exp([0.1, 0.2, 0.3]), atol=1e-12)
+    matrix[:3, :3] *= 1.0004
+    with pytest.raises(ValueError, match="not a rotation"):
+        Pose.from_matrix(matrix)
 
 
-@given(cameras, points)
-def test_gl_projection_puts_pixel_centres_where_opengl_samples(camera: Camera, p: np.ndarray) -> None:
-    near, far = 0.1, 10.0
-    clip = np.column_stack([p, np.ones(len(p))]) @ camera.gl_projection(near, far).T
-    ndc = clip[:, :3] / clip[:, 3:]
-    window = (ndc[:, :2] + 1) / 2 * (camera.width, camera.height)  # edge coordinates, first row first
-    np.testing.assert_allclose(window - 0.5, camera.project(p), atol=1e-6)
-    depth = [camera.gl_projection(near, far) @ [0, 0, z, 1] for z in (near, far)]
-    np.testing.assert_allclose([d[2] / d[3] for d in depth], [-1, 1], atol=1e-9)
+def test_the_nearest_rotation_is_no_reflection() -> None:
+    R = so3_exp([0.3, -0.4, 0.5])
+    np.testing.assert_allclose(nearest_rotation(R @ np.diag([2.0, 3.0, -0.1])), R, atol=1e-12)
+    np.testing.assert_allclose(nearest_rotation(R @ np.diag([2.0, 3.0, 0.1])), R, atol=1e-12)
 
 
-@given(cameras, points, st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3)), st.floats(0.02, 0.5))
-def test_project_after_zoom_is_zoom_after_project(
-    camera: Camera, p: np.ndarray, ray: tuple[float, float], half_width: float
-) -> None:
-    zoom = Zoom.look_at(camera, [*ray, 1.0], half_width, (160, 120))
-    turned = p @ zoom.R_view_cam.T
-    mapped = np.column_stack([camera.project(p), np.ones(len(p))]) @ zoom.homography.T
-    np.testing.assert_allclose(zoom.camera.project(turned), mapped[:, :2] / mapped[:, 2:], rtol=1e-6, atol=1e-6)
-
-
-@given(cameras, st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3)))
-def test_a_zoom_looks_along_its_ray_without_rolling(camera: Camera, ray: tuple[float, float]) -> None:
-    zoom = Zoom.look_at(camera, [*ray, 1.0], 0.1, (160, 120))
-    np.testing.assert_allclose(zoom.camera.project(zoom.R_view_cam @ [*ray, 1.0]), [79.5, 59.5], atol=1e-6)
-    edge = zoom.camera.backproject([[-0.5, 59.5], [159.5, 59.5]])
-    np.testing.assert_allclose(edge[:, 0], [-0.1, 0.1], atol=1e-12)
-
-
-def test_a_zoomed_picture_shows_what_its_camera_sees() -> None:
-    camera = Camera(500, 510, 315, 245, 640, 480)
-    x, y = np.meshgrid(np.arange(640), np.arange(480))
-    image = np.stack([x * 0.35, y * 0.5, 0 * x + 90], axis=-1).astype(np.uint8)
-    mask = (x > 400) & (x < 500) & (y > 100) & (y < 200)
-    zoom = Zoom.look_at(camera, camera.backproject([450, 150]), 0.12, (160, 120))
-    seen = View(image, camera, mask).zoomed(zoom)
-    rays = zoom.camera.backproject(zoom.camera.pixel_grid()) @ zoom.R_view_cam
-    pixels = camera.project(rays)
-    np.testing.assert_allclose(seen.image[..., 0], pixels[..., 0] * 0.35, atol=1.6)
-    np.testing.assert_allclose(seen.image[..., 1], pixels[..., 1] * 0.5, atol=1.6)
-    inside = (np.abs(pixels - (450, 150)) < 48).all(axis=-1)
-    assert seen.mask is not None
-    assert seen.mask[inside].all()
-    np.testing.assert_allclose(seen.R_view_cam, zoom.R_view_cam)
-
-
-def test_boxes_are_edges() -> None:
-    camera = Camera(100, 100, 9.5, 9.5, 20, 20)
-    np.testing.assert_allclose(camera.box_centre_ray((0, 0, 20, 20)), [0, 0, 1])
-    np.testing.assert_allclose(camera.points_box([[0, 0, 1]]), (10, 10, 10, 10))
-    np.testing.assert_allclose(camera.project(camera.box_corner_rays((0, 0, 20, 20)))[2], [19.5, 19.5])
-    mask = np.zeros((20, 20), dtype=bool)
-    assert mask_box(mask) is None
-    mask[0, 0] = True
-    assert mask_box(mask) == (0, 0, 1, 1)
-    mask[3, 5] = True
-    assert mask_box(mask) == (0, 0, 6, 4)
-
-
-def test_field_of_view() -> None:
-    camera = Camera.from_fov(np.deg2rad(60), 640, 480)
-    left, right = camera.backproject([[-0.5, 240], [639.5, 240]])
-    np.testing.assert_allclose(np.rad2deg(np.arctan(right[0]) - np.arctan(left[0])), 60)
-
-
-@pytest.mark.parametrize("values", [(0, 1, 0, 0), (1, 0, 0, 0), (-5, 5, 0, 0), (np.nan, 5, 0, 0), (5, 5, np.inf, 0)])
-def test_bad_intrinsics_are_refused(values: tuple[float, ...]) -> None:
-    with pytest.raises(CameraError, match=r"must be positive numbers of pixels. Give fx,fy,cx,cy"):
-        Camera(*values, 640, 480)
-    with pytest.raises(CameraError, match="at least 1 pixel"):
-        Camera(5, 5, 0, 0, 0, 480)
-    with pytest.raises(CameraError, match="3x3 numbers"):
-        Camera.from_K([1, 2, 3], 640, 480)
-
-
-def test_a_picture_and_a_camera_of_different_sizes_make_no_view() -> None:
-    with pytest.raises(ValueError, match=r"image is \(10, 10\), its camera \(480, 640\)"):
-        View(np.zeros((10, 10, 3), np.uint8), Camera(500, 500, 320, 240, 640, 480))
+def test_rotations_are_drawn_all_over() -> None:
+    rng = np.random.default_rng(2)
+    drawn = np.array([random_rotation(rng) for _ in range(3000)])
+    np.testing.assert_allclose(drawn.mean(axis=0), 0, atol=0.05)
+    np.testing.assert_allclose((drawn**2).mean(axis=0), 1 / 3, atol=0.03)

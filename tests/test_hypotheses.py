@@ -8,26 +8,21 @@ import numpy as np
 import pytest
 import torch
 
-from objects import bracket
-from posekit.camera import Camera, mask_box
+from objects import CAMERA, bracket
+from posekit.camera import mask_box
 from posekit.errors import WeightsError
 from posekit.estimate.refine import crops
-from posekit.first_pose.hypotheses import BoxSearch, EvidenceScorer, MVNetSearch, TemplateSearch, agreement_of
+from posekit.first_pose.hypotheses import BoxSearch, EvidenceScorer, TemplateSearch, agreement_of
+from posekit.first_pose.mvnet import MVNetSearch
 from posekit.geometry import Pose, random_rotation, rotation_angle, so3_exp
+from posekit.nets.config import PaperConfig
 from posekit.nets.heads import Prediction
 from posekit.nets.pose_delta import delta_between
-from posekit.nets.weights import PaperConfig, build
+from posekit.nets.weights import build
 from posekit.render import Light, Renderer
 from posekit.results import Detection, Source
 from posekit.view import View
 from posekit.zoom import zoom_to_box
-
-CAMERA = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
-
-
-@pytest.fixture(scope="module")
-def renderer() -> Renderer:
-    return Renderer()
 
 
 def seen(renderer: Renderer, truth: Pose) -> tuple[View, Detection]:

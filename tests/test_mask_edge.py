@@ -25,11 +25,6 @@ def model() -> ObjectModel:
     return bracket()
 
 
-@pytest.fixture(scope="module")
-def renderer() -> Renderer:
-    return Renderer()
-
-
 def cases(model: ObjectModel, renderer: Renderer, count: int = 6) -> list[tuple[View, Pose, Pose]]:
     """Views with exact masks, the truth, and a pose near it."""
     rng = np.random.default_rng(2)

@@ -23,7 +23,7 @@ def turned(angle: float, axis: tuple[float, float, float] = (0, 0, 1)) -> Pose:
 def test_plain_errors() -> None:
     moved = Pose(turned(0.3).R, GT.t + [0.03, 0.0, 0.04])
     assert metrics.rotation_error(moved, GT) == pytest.approx(0.3)
-    assert metrics.translation_error(moved, GT) == pytest.approx(0.05)
+    assert metrics.pose_error(moved, GT)[1] == pytest.approx(0.05)
     assert f"{metrics.rotation_error(GT, GT):.3f}" == "0.000"
 
 
@@ -56,9 +56,9 @@ def test_symmetries_count_the_nearest_truth() -> None:
     symmetries = Symmetries.parse("z:2", centre).transforms()
     flipped = GT @ symmetries[1]
     assert metrics.rotation_error(flipped, GT) == pytest.approx(np.pi)
-    assert metrics.translation_error(flipped, GT) == pytest.approx(0.04)  # the axis is beside the origin
+    assert metrics.pose_error(flipped, GT)[1] == pytest.approx(0.04)  # the axis is beside the origin
     assert metrics.rotation_error(flipped, GT, symmetries) == pytest.approx(0, abs=1e-9)
-    assert metrics.translation_error(flipped, GT, symmetries) == pytest.approx(0, abs=1e-9)
+    assert metrics.pose_error(flipped, GT, symmetries)[1] == pytest.approx(0, abs=1e-9)
 
 
 def test_continuous_symmetries_are_as_fine_as_their_steps() -> None:
@@ -74,6 +74,14 @@ def test_deepim_flips_beyond_a_right_angle_only() -> None:
     assert metrics.deepim_rotation_error(turned(np.deg2rad(80)), GT) == pytest.approx(np.deg2rad(80))
     both = metrics.deepim_rotation_error([turned(np.deg2rad(100)), turned(np.deg2rad(30))], GT)
     np.testing.assert_allclose(np.rad2deg(both), [80, 30])
+
+
+def test_deepim_flips_about_the_objects_own_z_axis() -> None:
+    tilt = so3_exp([0.2, -0.3, 0.1])
+    flipped = GT @ Pose.rotation(so3_exp([0, 0, np.pi])) @ Pose.rotation(tilt)
+    back = Pose.rotation(tilt) @ Pose.rotation(so3_exp([0, 0, np.pi]))
+    wanted = metrics.rotation_error(GT @ Pose.rotation(so3_exp([0, 0, np.pi])) @ back, GT)
+    assert metrics.deepim_rotation_error(flipped, GT) == pytest.approx(wanted)
 
 
 def test_within_is_strict() -> None:
@@ -215,6 +223,30 @@ def test_vsd_leaves_out_what_is_hidden() -> None:
     np.testing.assert_allclose(metrics.vsd(depths(), depths(), scene, FAR, 0.1, TAUS), 1.0)
 
 
+def test_vsd_against_its_definition() -> None:
+    """Pixel by pixel, with a wide lens, holes in the sensor's depth, and distances along the rays."""
+    rng, camera = np.random.default_rng(0), Camera(6.0, 7.0, 5.5, 3.5, 12, 8)
+    est, gt, scene = (rng.uniform(0.50, 0.56, (8, 12)) * (rng.random((8, 12)) < 0.7) for _ in range(3))
+    taus = [0.05, 0.2, 0.4]
+    for delta in (0.015, 0.03):
+        costs = np.zeros((3, 0))
+        for row in range(8):
+            for column in range(12):
+                length = float(np.linalg.norm([(column - 5.5) / 6, (row - 3.5) / 7, 1]))
+                e, g, s = (d[row, column] * length for d in (est, gt, scene))
+                seen_g = g > 0 and (s == 0 or g - s <= delta)
+                seen_e = e > 0 and (s == 0 or e - s <= delta or seen_g)
+                if seen_e and seen_g:
+                    costs = np.column_stack([costs, [abs(e - g) / 0.1 >= tau for tau in taus]])
+                elif seen_e or seen_g:
+                    costs = np.column_stack([costs, np.ones(3)])
+        found = metrics.vsd(est, gt, scene, camera, 0.1, taus, delta)
+        np.testing.assert_allclose(found, costs.mean(axis=1))
+        assert 0.2 < found[2] < found[0] < 1
+        if delta == 0.015:
+            np.testing.assert_array_equal(metrics.vsd(est, gt, scene, camera, 0.1, taus), found)
+
+
 # --- matching, precision ---------------------------------------------------------------------------------------------
 
 
@@ -233,53 +265,16 @@ def test_average_precision_of_hand_made_cases() -> None:
     assert metrics.average_precision([True, True, False], [0.9, 0.7, 0.8], 2) == pytest.approx((51 + 50 * 2 / 3) / 101)
 
 
-def test_box_iou() -> None:
-    boxes = [(0, 0, 2, 2), (1, 0, 3, 2), (5, 5, 6, 6)]
-    iou = metrics.box_iou(boxes[:1], boxes)
-    np.testing.assert_allclose(iou, [[1, 1 / 3, 0]])
+def test_precision_is_read_at_a_hundred_and_one_levels_of_recall() -> None:
+    rng = np.random.default_rng(1)
+    hits, scores, total = rng.random(60) < 0.5, rng.random(60), 40
+    order = np.argsort(-scores)
+    precision = np.cumsum(hits[order]) / np.arange(1, 61)
+    recall = np.cumsum(hits[order]) / total
+    wanted = [max((p for p, r in zip(precision, recall, strict=True) if r >= k / 100), default=0) for k in range(101)]
+    assert metrics.average_precision(hits, scores, total) == pytest.approx(np.mean(wanted))
 
 
-def test_coco_ap_equals_pycocotools() -> None:
-    from contextlib import redirect_stdout
-    from io import StringIO
-
-    from pycocotools.coco import COCO
-    from pycocotools.cocoeval import COCOeval
-
-    rng = np.random.default_rng(3)
-    annotations, results, pictures = [], [], []
-    for image in range(12):
-        true = [np.r_[xy, xy + rng.uniform(10, 40, 2)] for xy in rng.uniform(0, 100, (rng.integers(0, 5), 2))]
-        found = [t + rng.normal(0, 3, 4) for t in true for _ in range(rng.integers(0, 3))]
-        found += [np.r_[xy, xy + 20] for xy in rng.uniform(0, 100, (2, 2))]
-        scores = rng.random(len(found))
-        for t in true:
-            annotations.append({"id": len(annotations) + 1, "image_id": image, "category_id": 1, "iscrowd": 0,
-                                "bbox": [*t[:2], *(t[2:] - t[:2])], "area": float(np.prod(t[2:] - t[:2]))})  # fmt: skip
-        for f, s in zip(found, scores, strict=True):
-            results.append({"image_id": image, "category_id": 1, "bbox": [*f[:2], *(f[2:] - f[:2])], "score": s})
-        pictures.append((true, found, scores))
-    with redirect_stdout(StringIO()):
-        coco = COCO()
-        coco.dataset = {"images": [{"id": k} for k in range(12)], "annotations": annotations,
-                        "categories": [{"id": 1}], "info": {}}  # fmt: skip
-        coco.createIndex()
-        judge = COCOeval(coco, coco.loadRes(results), "bbox")
-        judge.evaluate()
-        judge.accumulate()
-        judge.summarize()
-    truths = [metrics.Regions(np.zeros(0), np.zeros(len(t), bool)) for t, _, _ in pictures]
-    detections = [metrics.Regions(s, np.zeros(0, bool)) for _, _, s in pictures]
-    overlaps = [metrics.box_iou(f, t) for t, f, _ in pictures]
-    assert 0.1 < judge.stats[0] < 0.9
-    assert metrics.coco_ap(truths, detections, overlaps) == pytest.approx(judge.stats[0], abs=1e-9)
-    assert metrics.coco_ap(truths, detections, overlaps, (0.5,)) == pytest.approx(judge.stats[1], abs=1e-9)
-
-
-def test_coco_ap_neither_asks_for_nor_holds_against_what_is_ignored() -> None:
-    truths = [metrics.Regions(np.zeros(0), np.array([False, True]))]
-    found = [metrics.Regions(np.array([0.9, 0.8]), np.zeros(0, bool))]
-    assert metrics.coco_ap(truths, found, [np.array([[0.0, 1.0], [1.0, 0.0]])]) == 1.0
-    assert metrics.coco_ap(truths, found, [np.array([[0.0, 0.0], [1.0, 0.0]])]) == pytest.approx(0.5)
-    nothing = [metrics.Regions(np.zeros(0), np.array([True]))]
-    assert np.isnan(metrics.coco_ap(nothing, found, [np.zeros((2, 1))]))
+def test_scores_that_are_alike_keep_their_order() -> None:
+    assert metrics.match([[1.0], [0.5]], [0.5, 0.5], 2.0).tolist() == [0, -1]
+    assert metrics.average_precision([False] + [True] * 20, [0.5] * 21, 20) < 1

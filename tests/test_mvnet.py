@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from objects import bracket
 from posekit.camera import Camera, mask_box
-from posekit.first_pose.mvnet import Answer, MatchingSearch
+from posekit.first_pose.mvnet import MatchingOutput, MatchingSearch
 from posekit.first_pose.view_bank import DISTANCE, ViewBank
 from posekit.geometry import Pose, fibonacci_sphere, random_rotation, rotation_angle, rotation_between
 from posekit.mesh.model import ObjectModel
@@ -59,11 +59,6 @@ class StandIn(nn.Module):
 def small_net() -> MatchingMVNet:
     torch.manual_seed(0)
     return MatchingMVNet(StandIn(Small().widths), Small(), channels=32, heads=2, blocks=2, inner=16, part=16)
-
-
-@pytest.fixture(scope="module")
-def renderer() -> Renderer:
-    return Renderer()
 
 
 @pytest.fixture(scope="module")
@@ -169,7 +164,7 @@ def test_the_turn_is_the_one_between_pictures(made) -> None:  # type: ignore[no-
     assert relation.near.argmax() == 0
 
 
-def oracle(search: MatchingSearch, crop: View, T_crop_ctr: Pose, model: ObjectModel, matched: bool) -> Answer:
+def oracle(search: MatchingSearch, crop: View, T_crop_ctr: Pose, model: ObjectModel, matched: bool) -> MatchingOutput:
     """What a perfect network says of a crop whose truth is known; without ``matched`` it finds no cells."""
     camera, (h, w) = crop.camera, QUERIES.cells
     drawn = Renderer().render(model, [T_crop_ctr @ model.T_ctr_obj], camera.resized(w, h), rgb=False)[0]
@@ -183,7 +178,7 @@ def oracle(search: MatchingSearch, crop: View, T_crop_ctr: Pose, model: ObjectMo
     logits = np.zeros((8, h * w, 65), np.float32)
     np.put_along_axis(logits, cell[..., None] if matched else np.full_like(cell, NONE)[..., None], 12.0, axis=2)
     silhouette = np.where(mask, 8.0, -8.0).astype(np.float32)
-    return Answer(best, logits, offset.reshape(8, 2, h, w), np.stack([silhouette] * 2),
+    return MatchingOutput(best, logits, offset.reshape(8, 2, h, w), np.stack([silhouette] * 2),
                   relation.near[best].astype(np.float32), relation.turn[best].astype(np.float32), 4.0)  # fmt: skip
 
 
@@ -202,11 +197,11 @@ def test_an_oracle_gives_the_true_pose(renderer: Renderer, matched: bool, monkey
         assert box is not None
         detection = Detection((box[0] - 6, box[1] + 4, box[2] + 3, box[3] + 8))
 
-        def told(crop: View, truth: Pose = truth) -> Answer:
+        def true_output(crop: View, truth: Pose = truth) -> MatchingOutput:
             T_crop_ctr = Pose.rotation(crop.R_view_cam) @ truth @ model.T_obj_ctr
             return oracle(search, crop, T_crop_ctr, model, matched)
 
-        monkeypatch.setattr(search, "answer", told)
+        monkeypatch.setattr(search, "output", true_output)
         result = search.examine(View(drawn.image, camera), detection, 3)
         best = result.hypotheses[0].T_cam_obj
         turns.append(np.rad2deg(rotation_angle(best.R.T @ truth.R)))

@@ -365,19 +365,6 @@ def test_a_simplified_mesh_looks_the_same(textured: bool) -> None:
         assert np.abs(before.image[both].astype(float) - after.image[both]).mean() < 4
 
 
-def test_points_are_spread_over_the_surface_and_repeatable() -> None:
-    model = ObjectModel.from_arrays(CORNERS, FACES)
-    points = model.sample_points(20_000, seed=3)
-    np.testing.assert_array_equal(points, model.sample_points(20_000, seed=3))
-    assert np.abs(points - model.sample_points(20_000, seed=4)).max() > 0
-    offset = np.abs(points - model.center) / (model.extents / 2)
-    np.testing.assert_allclose(offset.max(axis=1), 1, atol=1e-5)
-    share = [(offset[:, k] > 1 - 1e-5).mean() for k in range(3)]
-    areas = np.array([0.06 * 0.04, 0.10 * 0.04, 0.10 * 0.06])
-    np.testing.assert_allclose(share, areas / areas.sum(), atol=0.02)
-    np.testing.assert_allclose(points.mean(axis=0), model.center, atol=1e-3)
-
-
 # --- units ---
 
 

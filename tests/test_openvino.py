@@ -2,30 +2,37 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from objects import bracket
-from posekit.camera import Camera
+from objects import CAMERA, bracket
 from posekit.errors import ConfigError
 from posekit.estimate.refine import compare, update_pose
 from posekit.geometry import Pose, so3_exp, view_rotation
 from posekit.nets.openvino import OpenVinoPredictor
-from posekit.nets.predictor import NetworkPredictor
+from posekit.nets.predictor import Predictor
+from posekit.nets.pytorch import NetworkPredictor
 from posekit.nets.rigid import solved
+from posekit.nets.runtime import Runtime
 from posekit.nets.weights import build, load_networks
 from posekit.render import Renderer
 from posekit.view import View
 
-CAMERA = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
-
 
 @pytest.fixture(scope="module")
 def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cache")
+    """A user's cache with the converted network."""
+    cache = tmp_path_factory.mktemp("cache")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(cache))
+        _ = Runtime(runtime="openvino").predictor
+    return cache
 
 
 def test_both_runtimes_answer_alike_and_the_conversion_is_kept(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -36,7 +43,11 @@ def test_both_runtimes_answer_alike_and_the_conversion_is_kept(kept: Path, monke
     [drawn] = renderer.render(model, [truth], CAMERA)
     view, outline = View(drawn.image, CAMERA, drawn.mask), model.hull_ctr
     results = []
-    runtimes = [NetworkPredictor(networks, bfloat16=False), *(OpenVinoPredictor(networks, b, 1) for b in (False, True))]
+    runtimes: list[Predictor] = [NetworkPredictor(networks, bfloat16=False)]
+    for bfloat16 in (False, True):
+        runtimes.append(
+            OpenVinoPredictor(lambda: networks.svnet, networks.digest, networks.size, bfloat16=bfloat16, threads=1)
+        )
     for predictor in runtimes:
         [answer], [seen], [rendered] = compare(view, model, outline, [start], predictor, renderer)
         results.append((answer, update_pose(start, model, answer, seen, rendered, "correspondence")))
@@ -49,9 +60,8 @@ def test_both_runtimes_answer_alike_and_the_conversion_is_kept(kept: Path, monke
         assert np.median(away) < pixels / 4 and np.quantile(away, 0.9) < pixels
         assert answer.angle == pytest.approx(torch_answer.angle, abs=angle)
         np.testing.assert_allclose(pose.R, torch_pose.R, atol=angle)
-    [folder] = (kept / "posekit" / "openvino").iterdir()
+    [folder] = (kept / "posekit" / "openvino").glob(f"{networks.digest}-*")
     assert sorted(p.name for p in folder.iterdir()) == ["svnet.bin", "svnet.xml"]
-    assert networks.digest in folder.name
 
 
 def test_elimination_solves_as_the_library_does() -> None:
@@ -64,5 +74,30 @@ def test_elimination_solves_as_the_library_does() -> None:
 
 
 def test_the_paper_preset_is_refused() -> None:
-    with pytest.raises(ConfigError, match="preset lite, not paper"):
-        OpenVinoPredictor(build("paper"))
+    with pytest.raises(ConfigError, match="preset lite"):
+        Runtime(networks=build("paper"), runtime="openvino")
+
+
+def test_networks_of_a_training_run_in_torch() -> None:
+    assert Runtime(networks=build("lite")).runtime == "torch"
+    with pytest.raises(ConfigError, match="auto, openvino, torch"):
+        Runtime(runtime="onnx")
+
+
+def test_a_missing_openvino_is_said(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    monkeypatch.setitem(sys.modules, "openvino", None)
+    assert Runtime().runtime == "torch"
+    assert "OpenVINO cannot be used" in caplog.text
+
+
+def test_an_estimate_needs_no_torch(kept: Path) -> None:
+    """Where the converted network is kept, a pose from a box is found without importing PyTorch, which takes long."""
+    code = (
+        "import sys, numpy as np; from posekit.synth.example import make_example; from posekit.api import estimate\n"
+        "from posekit.render import Renderer\n"
+        "e = make_example(Renderer()); r = estimate(e.view, e.model, e.box)\n"
+        "assert 'torch' not in sys.modules, 'torch was imported'; print(r.best.iterations)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False,
+                          env={**os.environ, "XDG_CACHE_HOME": str(kept)})  # fmt: skip
+    assert done.returncode == 0, done.stderr

@@ -80,3 +80,44 @@ def test_weights_count_and_the_limits_are_exact() -> None:
         assert (there is not None) == known
     behind = Pose(pose.R, [0.0, 0.0, -0.7])
     assert solve_pnp(points, pixels, np.ones(40), np.ones(40), CAMERA, behind) is None
+
+
+def test_the_pose_found_balances_the_robustly_weighted_residuals() -> None:
+    """Cauchy's weights in units of each point's scale: the gradient vanishes there, and nowhere beside it."""
+    points, pose = case(1)
+    rng = np.random.default_rng(1)
+    scale, visible = rng.uniform(0.3, 4.0, 40), rng.uniform(0.2, 1.0, 40)
+    pixels = CAMERA.project(pose.apply(points)) + rng.normal(size=(40, 2)) * scale[:, None]
+    pixels[:4] += 6 * scale[:4, None]
+    found = solve_pnp(points, pixels, visible, scale, CAMERA, pose, PnpConfig(iterations=60))
+    assert found is not None
+
+    def residual(at: Pose) -> np.ndarray:
+        return np.asarray(CAMERA.project(at.apply(points)) - pixels)
+
+    size = np.linalg.norm(residual(found), axis=1) / scale
+    assert 1.5 * np.median(size) < 2.5, "the knee is the configured one here"
+    weight = np.repeat(visible / (1 + (size / 2.5) ** 2) / scale**2, 2)
+    J = differences(lambda step: residual(moved(found, step)).ravel(), 6)
+    away = np.linalg.solve(J.T @ (J * weight[:, None]), J.T @ (weight * residual(found).ravel()))
+    np.testing.assert_allclose(away, 0, atol=1e-6)
+
+
+def test_one_step_is_damped_by_a_share_of_the_diagonal() -> None:
+    points, pose = case(2)
+    start = moved(pose, np.array([0.02, -0.03, 0.01, 0.002, 0.001, -0.003]))
+    pixels = CAMERA.project(pose.apply(points))
+    J = differences(lambda step: CAMERA.project(moved(start, step).apply(points)).ravel(), 6)
+    A, off = J.T @ J, (CAMERA.project(start.apply(points)) - pixels).ravel()
+    for config, damping in ((PnpConfig(1, 1e9), 1e-3), (PnpConfig(1, 1e9, 0.5), 0.5)):
+        step = np.linalg.solve(A + damping * np.diag(np.diag(A)), -J.T @ off)
+        found = solve_pnp(points, pixels, np.ones(40), np.ones(40), CAMERA, start, config)
+        assert found is not None
+        np.testing.assert_allclose(found.matrix, moved(start, step).matrix, atol=1e-8)
+
+
+def test_no_point_may_be_behind_the_camera() -> None:
+    points, pose = case(0)
+    pixels = CAMERA.project(pose.apply(points))
+    points[5] = pose.inverse().apply([0.0, 0.0, 5e-4])
+    assert solve_pnp(points, pixels, np.ones(40), np.ones(40), CAMERA, pose) is None

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from objects import bracket
+from objects import CAMERA, bracket
 from posekit.align.pnp import solve_pnp
 from posekit.camera import Camera
 from posekit.errors import ConfigError
@@ -22,7 +22,6 @@ from posekit.render import Renderer
 from posekit.results import Step
 from posekit.view import View
 
-CAMERA = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
 RENDERER = Renderer()
 PLACES = [(0.0, 0.0, 0.7), (0.33, -0.2, 0.8), (-0.4, 0.27, 0.9)]  # the middle and near two corners
 
@@ -72,11 +71,6 @@ def photograph(renderer: Renderer, model: ObjectModel, truth: Pose) -> View:
 
 def errors(pose: Pose, truth: Pose) -> tuple[float, float]:
     return float(np.rad2deg(rotation_angle(pose.R.T @ truth.R))), float(np.linalg.norm(pose.t - truth.t))
-
-
-@pytest.fixture(scope="module")
-def renderer() -> Renderer:
-    return Renderer()
 
 
 @pytest.mark.parametrize("update", ["regression", "correspondence"])

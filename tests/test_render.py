@@ -27,11 +27,6 @@ SQUARE_FACES = np.array([[0, 1, 2], [0, 2, 3]])
 FACING = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0, 0, 1.0]))  # obj x right, y up, z towards the camera
 
 
-@pytest.fixture(scope="module")
-def renderer() -> Renderer:
-    return Renderer()
-
-
 def square(half_side: float, **kwargs) -> ObjectModel:
     return ObjectModel.from_arrays(UNIT_SQUARE * half_side, SQUARE_FACES, **kwargs)
 

@@ -66,6 +66,20 @@ def test_a_verdict_needs_both_score_and_angle(angle_deg: float, score: float, wo
     assert json.loads(estimate_to_json(found))["estimates"][0]["reliable"] is found.reliable
 
 
+def test_a_source_says_who_vouches_for_a_detection() -> None:
+    by_hand = {Source.BOX, Source.GRABCUT, Source.FILLED, Source.MASK}
+    assert {source for source in Source if source.by_hand} == by_hand
+    assert {source for source in Source if source.given} == by_hand | {Source.FILE}
+    assert Detection((0.0, 0.0, 1.0, 1.0)).score == 1.0, "what a person gives is certain"
+
+
+def test_the_mask_edges_deviation_is_kept() -> None:
+    [with_one, without] = estimates_from_json(
+        estimates_to_json([replace(estimate(), mask_edge_std=0.01), replace(estimate(), mask_edge_std=None)])
+    )
+    assert with_one.mask_edge_std == pytest.approx(0.01) and without.mask_edge_std is None
+
+
 def no_constant(name: str) -> float:
     raise AssertionError(f"{name} is not JSON")
 

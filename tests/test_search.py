@@ -14,18 +14,17 @@ from typer.testing import CliRunner
 
 from bop_scene import CAMERA, brick, put, write_scene
 from objects import bracket
-from posekit.camera import Camera, box_overlap
+from posekit.camera import Camera, box_iou
 from posekit.cli.app import app
 from posekit.datasets.bop import BopDataset
 from posekit.detect.segmentation import encode, xywh
 from posekit.estimate.estimator import EstimateOptions, Estimators
-from posekit.estimate.instances import SearchOptions, estimates_of, find_instances, judged
+from posekit.estimate.instances import SearchOptions, estimates_of, find_instances, scored_by_poses
 from posekit.evaluate import EvalOptions
 from posekit.evaluate.stages import ImageStage
 from posekit.evaluate.truths import Truth, TruthReader
 from posekit.geometry import Pose
 from posekit.mesh.model import ObjectModel
-from posekit.nets.weights import build, save_networks
 from posekit.results import Detection, Estimate, Source
 from posekit.tracking.tracker import LOST, RESTARTED, Tracker
 from posekit.view import View
@@ -45,11 +44,9 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def weights(example_folder: Path) -> Path:
     """Weights that nobody trained."""
-    path = tmp_path_factory.mktemp("weights") / "untrained"
-    save_networks(path, build("lite"), {"trained on": "nothing"})
-    return path
+    return example_folder / "untrained"
 
 
 def truths(root: Path) -> list[Truth]:
@@ -170,8 +167,8 @@ def test_instances_are_what_scores_and_does_not_overlap() -> None:
     assert kept(fixed, Source.BOX, SearchOptions(instances=0, min_score=0.3)) == [0.8, 0.5]
     assert kept(fixed, Source.BOX, SearchOptions(instances=1, min_score=0.3)) == [0.8]
     assert kept(fixed, Source.BOX, SearchOptions(min_score=0.9)) == []
-    assert box_overlap(BOXES[0], BOXES[1]) == pytest.approx(9 / 11)
-    assert box_overlap(BOXES[0], BOXES[2]) == 0 and box_overlap(BOXES[0], (0, 20, 10, 30)) == 0
+    assert box_iou(BOXES[0], BOXES[1]) == pytest.approx(9 / 11)
+    assert box_iou(BOXES[0], BOXES[2]) == 0 and box_iou(BOXES[0], (0, 20, 10, 30)) == 0
 
 
 def test_what_is_kept_depends_on_who_says_where_the_object_is() -> None:
@@ -179,7 +176,7 @@ def test_what_is_kept_depends_on_who_says_where_the_object_is() -> None:
     for source in (Source.BOX, Source.GRABCUT, Source.FILLED, Source.MASK):
         assert kept(fixed, source) == [0.8, 0.6, 0.5, 0.1], "as a person says"
     assert kept(fixed, Source.FILE) == [0.8, 0.5, 0.1], "all that do not overlap"
-    assert kept(fixed, Source.NOVEL) == kept(fixed, Source.TRAINED) == [0.8], "the best one, borne out"
+    assert kept(fixed, Source.NOVEL) == kept(fixed, Source.TRAINED) == [0.8], "the best one, confirmed"
     assert SearchOptions.usual([]) == SearchOptions()
     assert SearchOptions.usual([Detection(BOXES[0]), Detection(BOXES[1], source=Source.FILE)]).overlap == 0.5
     assert SearchOptions.usual([Detection(BOXES[0]), Detection(BOXES[1], source=Source.TRAINED)]).min_score == 0.5
@@ -210,7 +207,7 @@ def test_detections_are_judged_by_their_poses(source: Source) -> None:
     fixed = Fixed([0.2, 0.7], BOXES[1:3])
     detections = [Detection(box, None, 0.56, MODEL.name, source) for box in BOXES[:3]]
     [found] = find_instances(lambda _: fixed, VIEW, [MODEL], detections, SearchOptions())
-    assert [(d.box, d.score) for d in judged(found)] == [(BOXES[2], 0.7), (BOXES[1], 0.2), (BOXES[0], 0.0)]
+    assert [(d.box, d.score) for d in scored_by_poses(found)] == [(BOXES[2], 0.7), (BOXES[1], 0.2), (BOXES[0], 0.0)]
 
 
 @pytest.mark.parametrize(("score", "state"), [(0.45, LOST), (0.55, RESTARTED)])

@@ -62,11 +62,6 @@ def digest(root: Path) -> dict[str, str]:
     return {str(p.relative_to(root)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
 
 
-@pytest.fixture(scope="module")
-def renderer() -> Renderer:
-    return Renderer()
-
-
 @pytest.mark.parametrize("kind", ["randomised", "scenes", "sequence"])
 def test_its_own_truth_is_right(kind: str, tmp_path: Path, renderer: Renderer) -> None:
     """Read back, each pose has no error, and the mesh drawn there covers the mask; depth is the mesh's."""

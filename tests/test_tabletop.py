@@ -13,11 +13,6 @@ from posekit.synth.tabletop import DISTRACTOR, TabletopConfig, compose, procedur
 CONFIG = TabletopConfig(size=(160, 120), objects=(3, 5), distractors=(2, 3))
 
 
-@pytest.fixture(scope="module")
-def renderer() -> Renderer:
-    return Renderer()
-
-
 def test_labels_depth_and_counts_agree_with_a_rendering_of_each_object_alone(renderer: Renderer) -> None:
     rng = np.random.default_rng(3)
     others = procedural_objects(3, rng)

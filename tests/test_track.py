@@ -17,7 +17,7 @@ import pytest
 from typer.testing import CliRunner
 
 from bop_scene import write_scene
-from objects import bracket, cuboid
+from objects import CAMERA, bracket, cuboid
 from posekit.align.colour_edge import Tint, learn, off_colour, outline_lines
 from posekit.align.gauss_newton import GaussianPose, Points, fuse
 from posekit.camera import Camera
@@ -30,20 +30,14 @@ from posekit.mesh.model import ObjectModel
 from posekit.metrics import pose_error
 from posekit.render import Renderer
 from posekit.results import Detection, Estimate
-from posekit.synth.example import Example, make_example, ply
+from posekit.synth.example import Example, ply
 from posekit.tracking.points import Keyframe, follow_points, match_texture
 from posekit.tracking.tracker import LOST, RESTARTED, TRACKED, TrackConfig, Tracker
 from posekit.view import View
 from posekit.visualise.recording import Recorder
 from test_refine import Oracle
 
-CAMERA = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
 STEADY = TrackConfig()
-
-
-@pytest.fixture(scope="module")
-def renderer() -> Renderer:
-    return Renderer()
 
 
 @pytest.fixture(scope="module")
@@ -381,7 +375,7 @@ def test_what_cannot_be_tracked_is_said(model: ObjectModel, renderer: Renderer) 
     for wrong in (
         {"still_deg": 30},
         {"iterations": 0},
-        {"alike": 2},
+        {"min_colour_share": 2},
         {"keep": 0},
         {"mask": "true"},
         {"motion": "x"},
@@ -392,11 +386,6 @@ def test_what_cannot_be_tracked_is_said(model: ObjectModel, renderer: Renderer) 
 
 
 # --- the command ----------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def example(renderer: Renderer) -> Example:
-    return make_example(renderer)
 
 
 @pytest.fixture(scope="module")

@@ -41,9 +41,10 @@ from posekit.datasets.bop import BopDataset
 from posekit.errors import ConfigError, OutputError, TrainingError, WeightsError
 from posekit.geometry import Pose, random_rotation
 from posekit.mesh.model import ObjectModel
+from posekit.nets.config import LiteConfig
 from posekit.nets.flownet import LAYERS
 from posekit.nets.heads import compress_angle
-from posekit.nets.lite import LiteConfig, LiteSVNet
+from posekit.nets.lite import LiteSVNet
 from posekit.nets.paper import PaperSVNet
 from posekit.nets.weights import build, load_networks, save_networks
 from posekit.render import Renderer

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from objects import bracket
+from objects import CAMERA, bracket
 from posekit.align.colour_edge import learn, outline_lines
-from posekit.camera import Camera, Zoom
+from posekit.camera import Zoom
 from posekit.estimate.refine import crops
 from posekit.geometry import Pose, view_rotation
 from posekit.io.load import load_view
@@ -19,8 +19,6 @@ from posekit.io.video import open_frames
 from posekit.render import Renderer
 from posekit.tracking.points import Keyframe, follow_points
 from posekit.view import View
-
-CAMERA = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
 
 
 def black_backdrop() -> tuple[View, Pose]:

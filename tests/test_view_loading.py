@@ -25,7 +25,8 @@ import pytest
 from PIL import Image
 
 from posekit.errors import CameraError, ConfigError, ImageError, PromptError
-from posekit.io.load import camera_from_exif, load_camera, load_image, load_mask, load_pose, load_view, parse_box
+from posekit.io.calibration import load_calibration
+from posekit.io.load import camera_from_exif, load_image, load_mask, load_pose, load_view, parse_box
 
 PIXELS = np.random.default_rng(0).integers(0, 256, size=(48, 64, 3), dtype=np.uint8)
 SIZE = (64, 48)
@@ -378,7 +379,7 @@ def is_k(camera: object) -> None:
 
 
 def test_four_numbers() -> None:
-    is_k(load_camera("572.4, 573.5, 325.2, 242", VGA))
+    is_k(load_calibration("572.4, 573.5, 325.2, 242", VGA).camera)
 
 
 @pytest.mark.parametrize(
@@ -400,8 +401,8 @@ def test_four_numbers() -> None:
 )  # fmt: skip
 def test_camera_files(tmp_path: Path, name: str, text: str) -> None:
     (tmp_path / name).write_text(text)
-    is_k(load_camera(tmp_path / name, VGA))
-    is_k(load_camera(str(tmp_path / name), VGA))
+    is_k(load_calibration(tmp_path / name, VGA).camera)
+    is_k(load_calibration(str(tmp_path / name), VGA).camera)
 
 
 @pytest.mark.parametrize("suffix", ["yml", "yaml", "xml"])
@@ -414,21 +415,21 @@ def test_opencv_files(tmp_path: Path, suffix: str, key: str) -> None:
     storage.write(key, K)
     storage.write("distortion_coefficients", np.zeros(5))
     storage.release()
-    is_k(load_camera(path, VGA))
+    is_k(load_calibration(path, VGA).camera)
 
 
 def test_scene_camera_by_the_pictures_number(tmp_path: Path) -> None:
     path = tmp_path / "scene_camera.json"
     other = (K * [[2], [2], [1]]).ravel().tolist()
     path.write_text(json.dumps({"3": {"cam_K": K.ravel().tolist(), "depth_scale": 1.0}, "17": {"cam_K": other}}))
-    is_k(load_camera(path, VGA, "rgb/000003.png"))
-    assert load_camera(path, VGA, "rgb/000017.png").fx == pytest.approx(2 * 572.4)
+    is_k(load_calibration(path, VGA, "rgb/000003.png").camera)
+    assert load_calibration(path, VGA, "rgb/000017.png").camera.fx == pytest.approx(2 * 572.4)
     with pytest.raises(CameraError, match=r"scene_camera.json: it has no camera for image 4; it has 3, 17\. Name"):
-        load_camera(path, VGA, "rgb/000004.png")
+        load_calibration(path, VGA, "rgb/000004.png")
     with pytest.raises(CameraError, match="no camera for a picture without a number in its name"):
-        load_camera(path, VGA, "duck.png")
+        load_calibration(path, VGA, "duck.png")
     with pytest.raises(CameraError, match="no camera for a picture without a number"):
-        load_camera(path, VGA)
+        load_calibration(path, VGA)
 
 
 def camera_json(path: Path, width: int, height: int) -> Path:
@@ -438,15 +439,15 @@ def camera_json(path: Path, width: int, height: int) -> Path:
 
 def test_a_camera_for_another_size(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, logger="posekit")
-    camera = load_camera(camera_json(tmp_path / "c.json", 640, 480), (320, 240))
+    camera = load_calibration(camera_json(tmp_path / "c.json", 640, 480), (320, 240)).camera
     assert (camera.fx, camera.cx, camera.cy, camera.size) == (250, 159.5, 119.5, (320, 240))
     assert "scaled from 640x480 to the picture's 320x240" in caplog.text
     with pytest.raises(CameraError, match=r"is for pictures of 640x480 pixels, this one has 640x400, which is another"):
-        load_camera(tmp_path / "c.json", (640, 400))
+        load_calibration(tmp_path / "c.json", (640, 400))
 
 
 def test_a_principal_point_outside_is_told(caplog: pytest.LogCaptureFixture) -> None:
-    load_camera("500,500,960,540", VGA)
+    load_calibration("500,500,960,540", VGA)
     assert "the principal point (960, 540) lies outside the picture of 640x480" in caplog.text
 
 
@@ -472,24 +473,24 @@ def test_a_principal_point_outside_is_told(caplog: pytest.LogCaptureFixture) -> 
 def test_bad_camera_files(tmp_path: Path, name: str, text: str, why: str) -> None:
     (tmp_path / name).write_text(text)
     with pytest.raises(CameraError, match=why) as caught:
-        load_camera(tmp_path / name, VGA)
+        load_calibration(tmp_path / name, VGA)
     assert name in str(caught.value)
 
 
 @pytest.mark.parametrize("text", ["1,2,3", "0,0,0,0", "500,500,nan,240", "1,2,3,4,5", "-500,500,320,240"])
 def test_bad_numbers(text: str) -> None:
     with pytest.raises(CameraError, match=r"give fx,fy,cx,cy|Give fx,fy,cx,cy"):
-        load_camera(text, VGA)
+        load_calibration(text, VGA)
 
 
 def test_a_missing_camera_file(tmp_path: Path) -> None:
     with pytest.raises(CameraError, match=r"there is no camera file .*c.json: give fx,fy,cx,cy in pixels, or a file"):
-        load_camera(tmp_path / "c.json", VGA)
+        load_calibration(tmp_path / "c.json", VGA)
     with pytest.raises(CameraError, match="cannot be read"):
-        load_camera(tmp_path, VGA)
+        load_calibration(tmp_path, VGA)
     (tmp_path / "c.txt").write_bytes(bytes(range(128, 256)))
     with pytest.raises(CameraError, match="cannot be read"):
-        load_camera(tmp_path / "c.txt", VGA)
+        load_calibration(tmp_path / "c.txt", VGA)
 
 
 # --- EXIF ---

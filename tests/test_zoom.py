@@ -5,13 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from objects import bracket
-from posekit.camera import Camera, mask_box
-from posekit.errors import CameraError
+from objects import CAMERA, bracket
+from posekit.camera import Camera
 from posekit.geometry import Pose, view_rotation
 from posekit.zoom import box_window, frontal_camera, frontal_pose, zoom_to_box, zoom_to_pose
 
-CAMERA = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
 MODEL = bracket()
 HULL = MODEL.hull_ctr
 POSE = Pose(view_rotation([0.5, -1.0, 0.6]), np.array([0.1, -0.05, 0.7]))
@@ -68,6 +66,19 @@ def test_a_square_window_has_a_boxs_area() -> None:
     assert zoom.camera.size == (96, 96)
 
 
+def test_a_square_window_far_from_the_middle_has_a_boxs_area_too() -> None:
+    box = (560.0, 400.0, 639.0, 470.0)
+    wide = Camera(300.0, 300.0, 319.5, 239.5, 640, 480)
+    zoom = box_window(wide, box, 96, 0.4)
+    width, height = np.ptp(zoom.camera.project(wide.box_corner_rays(box) @ zoom.R_view_cam.T), axis=0)
+    assert np.sqrt(width * height) == pytest.approx(0.4 * 96)
+
+
+def test_a_boxs_window_is_not_enlarged_unless_asked() -> None:
+    box = (100.0, 80.0, 180.0, 120.0)
+    assert zoom_to_box(CAMERA, box, (160, 120)).camera == zoom_to_box(CAMERA, box, (160, 120), enlarge=1.0).camera
+
+
 def test_the_frontal_view_fills_its_camera() -> None:
     camera, distance = frontal_camera(MODEL, (160, 120))
     assert distance == pytest.approx(5 * MODEL.diameter) and camera.size == (160, 120)
@@ -76,35 +87,3 @@ def test_the_frontal_view_fills_its_camera() -> None:
     assert seen == pytest.approx(1.0)
     nearer = frontal_pose(camera, distance, Camera(camera.fx / 2, camera.fx / 2, 79.5, 59.5, 160, 120))
     np.testing.assert_allclose(nearer.t, [0, 0, 0.5 * distance])
-
-
-# --- the camera ------------------------------------------------------------------------------------------------------
-
-
-def test_the_box_round_points_and_masks() -> None:
-    camera = Camera(100.0, 200.0, 49.5, 29.5, 100, 60)
-    assert camera.points_box([[0.0, 0.0, 1.0], [0.1, 0.05, 1.0]]) == pytest.approx((50, 30, 60, 40))
-    assert camera.points_box([[0.0, 0.0, 2.0], [0.1, 0.05, 2.0]]) == pytest.approx((50, 30, 55, 35))
-    mask = np.zeros((6, 9), bool)
-    assert mask_box(mask) is None
-    mask[2:4, 3:8] = True
-    assert mask_box(mask) == (3, 2, 8, 4)
-
-
-def test_rays_through_a_box() -> None:
-    camera = Camera(100.0, 200.0, 49.5, 29.5, 100, 60)
-    np.testing.assert_allclose(camera.box_centre_ray((50, 30, 70, 50)), [0.1, 0.05, 1])
-    wanted = [[0, 0, 1], [0.2, 0, 1], [0.2, 0.1, 1], [0, 0.1, 1]]
-    np.testing.assert_allclose(camera.box_corner_rays((50, 30, 70, 50)), wanted)
-
-
-@pytest.mark.parametrize("size", [(0, 10), (10, 0), (-1, 10)])
-def test_a_camera_has_pixels(size: tuple[int, int]) -> None:
-    with pytest.raises(CameraError, match="at least 1 pixel"):
-        Camera(100.0, 100.0, 5.0, 5.0, *size)
-    assert Camera(100.0, 100.0, 0.0, 0.0, 1, 1).size == (1, 1)
-    with pytest.raises(CameraError, match="3x3"):
-        Camera.from_K(np.eye(2), 10, 10)
-    np.testing.assert_array_equal(
-        Camera.from_K([[3, 0, 1], [0, 4, 2], [0, 0, 1]], 10, 20).K[:2], [[3, 0, 1], [0, 4, 2]]
-    )

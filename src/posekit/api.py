@@ -120,7 +120,7 @@ def estimate(
     """The pose of an object in a photograph.
 
     image: a file, uint8 RGB (H, W, 3), or a View, whose own camera counts. model: a mesh's file (with ``units`` and
-    ``symmetry``), an ObjectModel, or a PoseEstimator, which spares loading the networks again for the next picture (and
+    ``symmetry``), an ObjectModel, or a PoseEstimator, which saves loading the networks again for the next picture (and
     has its own weights and options). box: edges (x0, y0, x1, y1), pixels. mask: a file or bool (H, W). Without either
     the object is looked for. camera: a Camera, or what ``--camera`` takes; without it the photograph's EXIF data, else
     a field of view of 60 degrees, with a warning.

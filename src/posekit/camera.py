@@ -1,4 +1,4 @@
-"""Camera: the only place that knows half pixels and OpenGL's clip space."""
+"""Camera: the only place with half-pixel offsets and OpenGL's clip space."""
 
 from __future__ import annotations
 
@@ -56,6 +56,7 @@ class Camera:
 
     @property
     def K(self) -> Array:
+        """The intrinsic matrix (3, 3), pixels; float64."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
 
     @property
@@ -127,12 +128,30 @@ def mask_box(mask: NDArray[np.bool_]) -> Box | None:
     return float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1)
 
 
-def box_overlap(a: Box, b: Box) -> float:
-    """Intersection over union of two boxes (edges)."""
-    width = min(a[2], b[2]) - max(a[0], b[0])
-    height = min(a[3], b[3]) - max(a[1], b[1])
-    both = max(width, 0.0) * max(height, 0.0)
-    return both / max((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - both, 1e-9)
+def box_mask(box: Box, size: tuple[int, int]) -> NDArray[np.bool_]:
+    """The filled box (edges), bool (H, W): all pixels whose greater part lies in it, at least one where the box meets
+    the picture of ``size`` (width, height)."""
+    width, height = size
+    mask = np.zeros((height, width), dtype=np.bool_)
+    if box[2] > 0 and box[3] > 0 and box[0] < width and box[1] < height:
+        x0, y0 = (min(max(round(low), 0), most - 1) for low, most in zip(box[:2], size, strict=True))
+        mask[y0 : max(round(box[3]), y0 + 1), x0 : max(round(box[2]), x0 + 1)] = True
+    return mask
+
+
+def box_iou(a: ArrayLike, b: ArrayLike) -> Array:
+    """Intersection over union of boxes (..., 4) and (..., 4), edges, which broadcast: (...); 0 where both are empty."""
+    first, second = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+    low, high = np.maximum(first[..., :2], second[..., :2]), np.minimum(first[..., 2:], second[..., 2:])
+    common = np.clip(high - low, 0, None).prod(axis=-1)
+    area_a, area_b = ((x[..., 2:] - x[..., :2]).prod(axis=-1) for x in (first, second))
+    union = np.asarray(area_a + area_b - common)
+    return np.divide(common, union, out=np.zeros_like(union), where=union > 0)[()]
+
+
+def mask_iou(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
+    """Intersection over union of two masks (H, W) of one picture; 0 where both are empty."""
+    return float((a & b).sum() / max(1, (a | b).sum()))
 
 
 @dataclass(frozen=True, eq=False)

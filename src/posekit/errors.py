@@ -10,7 +10,7 @@ PosekitError
 ├── OutputError       a folder or file that cannot be written, or would be overwritten
 ├── WeightsError      weights that are missing, damaged or of another preset
 ├── RenderError       no usable OpenGL, or a rendering that failed
-└── TrainingError     a training that cannot go on
+└── TrainingError     a training that cannot continue
 """
 
 
@@ -19,40 +19,40 @@ class PosekitError(Exception):
 
 
 class InputError(PosekitError):
-    pass
+    """A file, an option or an array that cannot be used."""
 
 
 class ImageError(InputError):
-    pass
+    """A picture or video that cannot be used."""
 
 
 class MeshError(InputError):
-    pass
+    """A CAD mesh or its symmetries that cannot be used."""
 
 
 class CameraError(InputError):
-    pass
+    """Intrinsics that are missing or make no camera."""
 
 
 class PromptError(InputError):
-    pass
+    """A box, mask, pose or detections file that cannot be used."""
 
 
 class ConfigError(InputError):
-    pass
+    """A TOML file or a combination of options that makes no sense."""
 
 
 class OutputError(PosekitError):
-    pass
+    """A folder or file that cannot be written, or would be overwritten."""
 
 
 class WeightsError(PosekitError):
-    pass
+    """Weights that are missing, damaged or of another preset."""
 
 
 class RenderError(PosekitError):
-    pass
+    """No usable OpenGL, or a rendering that failed."""
 
 
 class TrainingError(PosekitError):
-    pass
+    """A training that cannot continue."""

@@ -30,14 +30,17 @@ class Pose:
 
     @classmethod
     def identity(cls) -> Pose:
+        """The transform that moves nothing."""
         return cls(np.eye(3), np.zeros(3))
 
     @classmethod
     def translation(cls, t: ArrayLike) -> Pose:
+        """A pure translation; t: (3,) metres."""
         return cls(np.eye(3), np.asarray(t))
 
     @classmethod
     def rotation(cls, R: ArrayLike) -> Pose:
+        """A pure rotation; R: (3, 3)."""
         return cls(np.asarray(R), np.zeros(3))
 
     @classmethod
@@ -65,6 +68,7 @@ class Pose:
         return rotation_to_quat(self.R)
 
     def inverse(self) -> Pose:
+        """``T_b_a`` of ``T_a_b``."""
         return Pose(self.R.T, -self.R.T @ self.t)
 
     def __matmul__(self, other: Pose) -> Pose:

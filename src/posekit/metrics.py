@@ -8,7 +8,6 @@ One pose gives a number, N poses give (N,). Symmetries are transforms ``T_obj_ob
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,8 +22,6 @@ Poses = Pose | Sequence[Pose] | ArrayLike
 Cameras = Camera | ArrayLike  # one for all poses, or matrices (3, 3) or (N, 3, 3)
 
 BOP_STEPS = 315  # turns that BOP makes of a continuous symmetry: Symmetries.transforms(BOP_STEPS)
-COCO_IOU = tuple(float(v) for v in np.linspace(0.5, 0.95, 10))
-COCO_MOST = 100  # detections per picture and class
 _ALONE = (Pose.identity(),)
 _CHUNK = 60_000  # distances that are computed at a time
 
@@ -44,11 +41,6 @@ def pose_error(estimated: Poses, truth: Poses, symmetries: Sequence[Pose] = _ALO
 def rotation_error(estimated: Poses, truth: Poses, symmetries: Sequence[Pose] = _ALONE) -> Array:
     """Geodesic angle, radians."""
     return pose_error(estimated, truth, symmetries)[0]
-
-
-def translation_error(estimated: Poses, truth: Poses, symmetries: Sequence[Pose] = _ALONE) -> Array:
-    """Distance of the origins, metres, to the symmetric truth with the nearest rotation."""
-    return pose_error(estimated, truth, symmetries)[1]
 
 
 def deepim_rotation_error(estimated: Poses, truth: Poses) -> Array:
@@ -185,70 +177,6 @@ def average_precision(hits: ArrayLike, scores: ArrayLike, total: int) -> float:
     precision = np.maximum.accumulate((found / np.arange(1, len(found) + 1))[::-1])[::-1]
     first = np.searchsorted(found / total, np.linspace(0, 1, 101), side="left")
     return float(np.append(precision, 0.0)[first].mean())
-
-
-def coco_ap(
-    truths: Sequence[Regions],
-    found: Sequence[Regions],
-    overlaps: Sequence[Array],
-    thresholds: Sequence[float] = COCO_IOU,
-) -> float:
-    """COCO's AP of one class: the mean over IoU 0.50, 0.55, ..., 0.95, or AP50 with the threshold 0.5 alone. Each
-    argument but the last has one entry per picture.
-
-    overlaps: IoU (D, G) of detections and truths, of boxes (`box_iou`) or of masks.
-    NaN where there is nothing to be found.
-    """
-    total = sum(int((~t.ignored).sum()) for t in truths)
-    if not total:
-        return float("nan")
-    levels = []
-    for threshold in thresholds:
-        hits, scores = [], []
-        for truth, here, iou in zip(truths, found, overlaps, strict=True):
-            order = np.argsort(-here.scores, kind="stable")[:COCO_MOST]
-            hit, ignore = _coco_match(iou[order], truth.ignored, threshold)
-            hits.append(hit[~ignore])
-            scores.append(here.scores[order][~ignore])
-        levels.append(average_precision(np.concatenate(hits), np.concatenate(scores), total))
-    return float(np.mean(levels))
-
-
-@dataclass(frozen=True, eq=False)
-class Regions:
-    """Boxes or masks of one class in one picture. scores: (N,) of detections. ignored: (N,) of truths, which count
-    neither as found nor as missed."""
-
-    scores: Array
-    ignored: NDArray[np.bool_]
-
-
-def box_iou(a: ArrayLike, b: ArrayLike) -> Array:
-    """Intersection over union (A, B) of boxes (A, 4) and (B, 4), edges."""
-    first, second = np.asarray(a, dtype=np.float64).reshape(-1, 4), np.asarray(b, dtype=np.float64).reshape(-1, 4)
-    low = np.maximum(first[:, None, :2], second[None, :, :2])
-    high = np.minimum(first[:, None, 2:], second[None, :, 2:])
-    common = np.clip(high - low, 0, None).prod(axis=-1)
-    area_a, area_b = ((x[:, 2:] - x[:, :2]).prod(axis=-1) for x in (first, second))
-    union = area_a[:, None] + area_b - common
-    return np.asarray(np.divide(common, union, out=np.zeros_like(common), where=union > 0))
-
-
-def _coco_match(
-    iou: Array, ignored: NDArray[np.bool_], threshold: float
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which detections (sorted by score) hit a truth, and which are to be ignored."""
-    hit, ignore = np.zeros(len(iou), dtype=np.bool_), np.zeros(len(iou), dtype=np.bool_)
-    free = np.ones(len(ignored), dtype=np.bool_)
-    for d, overlap in enumerate(iou):
-        usable = free & (overlap >= min(threshold, 1 - 1e-10))
-        real = usable & ~ignored
-        chosen = real if real.any() else usable
-        if chosen.any():
-            g = int(np.where(chosen, overlap, -1.0).argmax())
-            free[g] = False
-            hit[d], ignore[d] = not ignored[g], ignored[g]
-    return hit, ignore
 
 
 # --- inside ----------------------------------------------------------------------------------------------------------

@@ -46,6 +46,7 @@ class View:
         return np.ones(self.image.shape[:2], np.bool_) if self.valid is None else self.valid
 
     def with_mask(self, mask: NDArray[np.bool_] | None) -> View:
+        """The same view with another mask, bool (H, W), or with none."""
         return replace(self, mask=mask)
 
     def zoomed(self, zoom: Zoom) -> View:

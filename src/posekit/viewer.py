@@ -157,7 +157,8 @@ class Pictures(Protocol):
     """Photographs with poses, by their place from 0."""
 
     @property
-    def count(self) -> int: ...
+    def count(self) -> int:
+        """How many there are."""
 
     def label(self, index: int) -> str:
         """What the page calls it."""
@@ -182,15 +183,19 @@ class Photograph:
     count: int = 1
 
     def label(self, index: int) -> str:  # noqa: ARG002 - there is one
+        """Its name."""
         return self.name
 
     def number(self, index: int) -> int | None:  # noqa: ARG002
+        """None: it is not of a video."""
         return None
 
     def view(self, index: int) -> View:  # noqa: ARG002
+        """The picture itself."""
         return self.picture
 
     def candidates(self, index: int) -> Sequence[Candidate]:  # noqa: ARG002
+        """The poses that were given."""
         return self.poses
 
 
@@ -217,18 +222,22 @@ class TrackedVideo:
         self._kept: dict[int, Frame] = {}
 
     def label(self, index: int) -> str:
+        """ "frame N"."""
         return f"frame {self.tracked[index].number}"
 
     def number(self, index: int) -> int | None:
+        """The frame's number in its video."""
         return self.tracked[index].number
 
     def view(self, index: int) -> View:
+        """The decoded frame. Raises ImageError where it cannot be decoded or has no camera."""
         frame = self._frame(self.tracked[index].number)
         if frame.image is None or frame.camera is None:
             raise ImageError(frame.problem or f"frame {frame.number} cannot be read.")
         return View(frame.image, frame.camera, valid=frame.valid)
 
     def candidates(self, index: int) -> Sequence[Candidate]:
+        """The tracked pose, none where the object was lost."""
         found = self.tracked[index]
         if found.T_cam_obj is None:
             return []
@@ -390,6 +399,7 @@ class Shown:
 
     @property
     def chosen(self) -> Candidate:
+        """The candidate that is shown."""
         return self.candidates[self.choice]
 
     def choosing(self, choice: int) -> Shown:
@@ -588,6 +598,7 @@ class PoseViewer:
 
     @property
     def url(self) -> str:
+        """Where a browser finds the page."""
         return f"http://{HOST}:{self.server.get_port()}"
 
     def __enter__(self) -> PoseViewer:

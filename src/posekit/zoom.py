@@ -33,7 +33,7 @@ def zoom_to_pose(
         raise ValueError(f"the pose's origin {T_cam_ctr.t} is not in front of the camera")
     ray = T_cam_ctr.t / T_cam_ctr.t[2]
     points = T_cam_ctr.apply(outline)
-    # a part of the object that is nearly beside the camera must not blow up the window
+    # a part of the object that is nearly beside the camera must not make the window too large
     points[:, 2] = np.maximum(points[:, 2], 0.1 * T_cam_ctr.t[2])
     if box is not None:
         points = np.concatenate([points, camera.box_corner_rays(box)])
@@ -68,7 +68,7 @@ def frontal_camera(model: ObjectModel, size: tuple[int, int]) -> tuple[Camera, f
 
 
 def frontal_pose(camera: Camera, distance: float, crop_camera: Camera) -> Pose:
-    """The ``T_view_ctr`` to which MV-Net's answer is relative: the frontal view in the middle of a crop, at the depth
+    """The ``T_view_ctr`` to which MV-Net's output is relative: the frontal view in the middle of a crop, at the depth
     at which it looks as large there as in ``camera`` at ``distance`` (both from `frontal_camera`)."""
     return Pose(cube_views()[0], np.array([0, 0, distance * crop_camera.fx / camera.fx]))
 

@@ -26,14 +26,15 @@ BINS = 32  # of each channel
 COUNT = 240  # lines at most
 REACH, TAIL = 6, 4  # pixels: how far an outline is looked for, and what is looked at beyond
 CLEAR, SOFT = 0.42, 0.7  # the step between inside and outside: half its height, and its width in pixels
-SIGMA = 0.5  # pixels, no outline is surer
+SIGMA = 0.5  # pixels, the least standard deviation of a line
 LEAST = 20  # lines
 MIXED, BOTH, EDGE = 2, 2, 30.0  # pixels to either side that mix colours, that show them, and a clear step's grey values
-GAP, RING = 1, 14  # pixels beside the outline that teach no colours, and how far the surroundings reach
-BLUR = 1.0  # pixels over which neighbours decide together whose they are
+GAP, RING = 1, 14  # pixels beside the outline that no colours are learned from, and how far the surroundings reach
+BLUR = 1.0  # pixels over which neighbouring probabilities are averaged
 HUE = 0.12  # distance of chromaticities beyond which a pixel is not the mesh's
 SUDDEN, SMOOTH = 0.12, 1.0  # the same beyond what it has been before; pixels over which that is averaged
-HIDDEN, BESIDE = 2, 5  # pixels: how deep a hidden part is that no pose's error explains, and how far it spoils outlines
+# pixels: how deep a hidden part is that no pose's error explains, and how near to it outlines are not used
+HIDDEN, BESIDE = 2, 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +57,7 @@ class Colours:
         return np.asarray(inside / (inside + outside), np.float32)
 
     def posterior(self, image: NDArray[np.uint8]) -> FArray:
-        """The chance (...) that a pixel of this colour is the object's; image: uint8 RGB (..., 3)."""
+        """The probability (...) that a pixel of this colour is the object's; image: uint8 RGB (..., 3)."""
         return np.asarray(self.chance[_index(image)], np.float32)
 
     def seen(self, view: View) -> Mask:
@@ -113,7 +114,7 @@ def outline_lines(
     view: View, drawn: View, colours: Colours, seen: Mask, center: Array, outline: Outline | None = None
 ) -> Lines | None:
     """Where the outline of ``drawn`` (mask and coords) should lie in a frame's crop of the same camera; None where too
-    little of it can be told. seen: (H, W), what the crop shows of the object: outlines elsewhere are not believed.
+    little of it can be found. seen: (H, W), what the crop shows of the object: outlines elsewhere are not used.
     center: (3,), the model's. outline: of ``drawn.mask``, where it is known already."""
     assert drawn.mask is not None and drawn.coords is not None
     pixels, normals = outline or find_outline(drawn.mask)
@@ -129,10 +130,10 @@ def outline_lines(
     places = pixels + normals * mean[:, None]
     there, _ = _pixels(places, view)
     near = cv2.dilate(seen.astype(np.uint8), np.ones((5, 5), np.uint8))[there[:, 1], there[:, 0]] > 0
-    # the edge of what hides the object is taken for its outline, and draws it along
+    # the edge of what hides the object would be taken for its outline
     hidden = cv2.erode((drawn.mask & ~seen).astype(np.uint8), _disc(HIDDEN))
-    spoilt = cv2.dilate(hidden, _disc(HIDDEN + BESIDE))[pixels[:, 1].astype(int), pixels[:, 0].astype(int)] > 0
-    usable = near & ~spoilt & (sigma < 0.5 * REACH) & (np.abs(mean) < REACH - 1.5)
+    near_occluder = cv2.dilate(hidden, _disc(HIDDEN + BESIDE))[pixels[:, 1].astype(int), pixels[:, 0].astype(int)] > 0
+    usable = near & ~near_occluder & (sigma < 0.5 * REACH) & (np.abs(mean) < REACH - 1.5)
     usable &= inside[:, TAIL:-TAIL].mean(axis=1) > 0.9
     if usable.sum() < LEAST:
         return None
@@ -172,8 +173,8 @@ def _offsets(posterior: FArray, along: FArray) -> tuple[FArray, FArray]:
 def _halfway(image: NDArray[np.uint8], mean: FArray) -> FArray:
     """Offsets (N,) again, where each line (N, S, 3) is halfway between the colours on either side.
 
-    Pixels that mix the two are like neither, and by their chances the object's or its surroundings' depending on what
-    colours these have: outlines found by chances alone lie up to a pixel too far out or in.
+    Pixels that mix the two are similar to neither, and by their chances the object's or its surroundings' depending on
+    what colours these have: outlines found by chances alone lie up to a pixel too far out or in.
     """
     middle = np.rint(mean).astype(np.intp)
     window = middle[:, None] + np.arange(-MIXED - BOTH, MIXED + BOTH + 1) + image.shape[1] // 2
@@ -202,7 +203,7 @@ def _index(image: NDArray[np.uint8]) -> NDArray[np.intp]:
 
 def _histogram(index: NDArray[np.intp]) -> FArray:
     counts = np.bincount(index, minlength=BINS**3).astype(np.float32).reshape(BINS, BINS, BINS)
-    for axis in range(3):  # neighbouring colours are alike
+    for axis in range(3):  # neighbouring colours are similar
         counts = 0.5 * counts + 0.25 * (np.roll(counts, 1, axis) + np.roll(counts, -1, axis))
     return np.asarray(counts.ravel() / max(1.0, float(counts.sum())), np.float32)
 

@@ -116,8 +116,8 @@ class Points:
     """Points of the object that were seen at pixels.
 
     points: (N, 3) metres in ``ctr``. pixels: (N, 2). weight: (N,), 0 to 1. sigma: (N,), standard deviations in pixels.
-    knee: in standard deviations, where a point loses three quarters of its weight (Geman and McClure). correlated: so
-    many of them err alike.
+    knee: in standard deviations, where a point loses three quarters of its weight (Geman and McClure). correlated: the
+    number of them whose errors are correlated, which count as one.
     """
 
     points: Array

@@ -38,7 +38,7 @@ class MaskEdgeConfig:
     steps: int = 10  # of Gauss-Newton, each with a rendering
     knee: float = 1.0  # pixels of the photograph at which a point loses three quarters of its weight
     sigma: float = 0.3  # pixels, of a distance
-    correlated: float = 4.0  # so many neighbouring pixels of the outline err alike
+    correlated: float = 4.0  # number of neighbouring pixels of the outline whose errors are correlated
     turn: float = float(np.deg2rad(8.0))  # radians that the given pose may be off
     shift: float = 6.0  # likewise, crop pixels
     depth: float = 0.02  # likewise, share of the distance
@@ -49,7 +49,7 @@ class MaskEdgeConfig:
 @dataclass(frozen=True, eq=False)
 class MaskEdgeFit:
     """covered: how much of the rendered outline has the mask's near it, 0 to 1. share: how much of that lies within a
-    pixel of it. turn_std: standard deviation of the rotation, radians, as far as outline and given pose tell."""
+    pixel of it. turn_std: standard deviation of the rotation, radians, from the outline and the given pose."""
 
     T_cam_obj: Pose
     covered: float
@@ -154,8 +154,8 @@ def _equations(crop: _Crop, start: Pose, grown: float, config: MaskEdgeConfig) -
 
 def _outline(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """The mask's outermost pixels (H, W), but for those at the picture's edge."""
-    worn = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    outline = mask & ~worn
+    eroded = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    outline = mask & ~eroded
     outline[[0, -1]] = outline[:, [0, -1]] = False
     return outline
 

@@ -115,10 +115,10 @@ def detect(
 def _verified(
     view: View, found: Sequence[Detection], meshes: Sequence[ObjectModel], min_score: float
 ) -> list[Detection]:
-    """What a pose speaks for, best first, scored by it."""
+    """The detections that a pose confirms, best first, with the scores of the poses."""
     from posekit.estimate.estimator import Estimators
-    from posekit.estimate.instances import SearchOptions, find_instances, judged
+    from posekit.estimate.instances import SearchOptions, find_instances, scored_by_poses
 
     results = find_instances(Estimators(), view, meshes, found, SearchOptions(min_score=min_score))
-    kept = [d for each in results for d in judged(each) if d.score >= min_score]
+    kept = [d for each in results for d in scored_by_poses(each) if d.score >= min_score]
     return sorted(kept, key=lambda d: -d.score)

@@ -97,7 +97,8 @@ def _openvino() -> list[Finding]:
 
 def _weights() -> list[Finding]:
     try:
-        from posekit.nets.weights import PRESETS, find_weights, load_networks
+        from posekit.nets.config import PRESETS, find_weights
+        from posekit.nets.weights import load_networks
     except (ImportError, OSError):
         return []  # torch's own finding says why
     found = []
@@ -110,11 +111,11 @@ def _weights() -> list[Finding]:
             todo = _reinstall("posekit") if essential else ""
             found.append(Finding(topic, str(error), "problem" if essential else "note", todo))
             continue
-        found.append(Finding(topic, f"{path}\nhash {networks.digest}\n{_told(networks.about)}".strip()))
+        found.append(Finding(topic, f"{path}\nhash {networks.digest}\n{_line(networks.about)}".strip()))
     return found
 
 
-def _told(about: Mapping[str, Any]) -> str:
+def _line(about: Mapping[str, Any]) -> str:
     """What the weights' TOML says of their training and figures, in one line."""
     parts = []
     for key, value in about.items():
@@ -122,7 +123,7 @@ def _told(about: Mapping[str, Any]) -> str:
             parts.append(f"{key.replace('_', ' ')} {len(value)}")
             continue
         text = (
-            f"({_told(value)})" if isinstance(value, Mapping) else f"{value:.4g}" if isinstance(value, float) else value
+            f"({_line(value)})" if isinstance(value, Mapping) else f"{value:.4g}" if isinstance(value, float) else value
         )
         parts.append(f"{key.replace('_', ' ')} {text}")
     return ", ".join(parts)

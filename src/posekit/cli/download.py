@@ -15,7 +15,7 @@ def download(
     ] = None,
     keep: Annotated[bool, typer.Option("--keep", help="Keep the archives.")] = False,
 ) -> None:
-    """Fetch a data set in BOP layout; a download that was interrupted goes on where it stopped."""
+    """Fetch a data set in BOP layout; a download that was interrupted is resumed."""
     from posekit.datasets.download import download as fetch
     from posekit.datasets.registry import data_folder, dataset_info
 

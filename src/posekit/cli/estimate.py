@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -19,7 +19,9 @@ from posekit.cli.options import (
     DeviceOption,
     ForceOption,
     FormatOption,
+    HypothesesOption,
     ImageArgument,
+    InitOption,
     IterationsOption,
     JsonOption,
     MaskEdgeOption,
@@ -41,10 +43,6 @@ from posekit.cli.options import (
 
 CANDIDATES = 3  # detections of a mesh that are estimated at least, of which the best estimate is kept
 
-InitOption = Annotated[
-    Literal["templates", "mvnet"], typer.Option(help="Where first poses come from.", rich_help_panel=LOOP)
-]
-HypothesesOption = Annotated[int, typer.Option(metavar="K", help="First poses to refine.", rich_help_panel=LOOP)]
 TopOption = Annotated[
     int,
     typer.Option(

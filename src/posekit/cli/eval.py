@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from posekit.cli.estimate import HypothesesOption, InitOption
 from posekit.cli.options import (
     LOOP,
     OUTPUT,
     ColourEdgeOption,
     DeviceOption,
+    HypothesesOption,
+    InitOption,
     IterationsOption,
     MaskEdgeOption,
     PerturbOption,
@@ -25,10 +25,10 @@ from posekit.cli.options import (
     UpdateOption,
     WeightsOption,
 )
+from posekit.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     from posekit.evaluate import Comparison
-    from posekit.evaluate.run import Progress
 
 DATA, STAGE = "Data", "Stage"
 
@@ -49,7 +49,7 @@ def evaluate(
     ] = None,
     split: Annotated[str | None, typer.Option(help="Folder with the scenes.", rich_help_panel=DATA)] = None,
     units: Annotated[
-        Units, typer.Option(help="Of the meshes; auto: BOP's mm, or what models_info.json tells.", rich_help_panel=DATA)
+        Units, typer.Option(help="Of the meshes; auto: BOP's mm, or what fits models_info.json.", rich_help_panel=DATA)
     ] = "auto",
     objects: Annotated[
         str | None, typer.Option(metavar="1,9|ape,duck", help="Only these objects.", rich_help_panel=DATA)
@@ -105,11 +105,11 @@ def evaluate(
     out: Annotated[
         Path | None,
         typer.Option(
-            metavar="DIR", help="Folder for the results; the same run in it is gone on with.", rich_help_panel=OUTPUT
+            metavar="DIR", help="Folder for the results; the same run in it is continued.", rich_help_panel=OUTPUT
         ),
     ] = None,
     force: Annotated[
-        bool, typer.Option("--force", help="Throw an evaluation in that folder away.", rich_help_panel=OUTPUT)
+        bool, typer.Option("--force", help="Delete an evaluation in that folder.", rich_help_panel=OUTPUT)
     ] = False,
     comparison: Annotated[
         tuple[Path, Path] | None,
@@ -118,7 +118,7 @@ def evaluate(
 ) -> None:
     """Measure poses as the field does: tables, results.json, a BOP CSV and an HTML report.
 
-    A killed run goes on where it was when the command is given again.
+    A killed run continues when the same command is given again.
     """
     if comparison is not None:
         from posekit.evaluate import compare
@@ -156,8 +156,11 @@ def evaluate(
     )
     name = dataset or (root.resolve().name if root is not None else "data")
     folder = out or Path("posekit-out") / f"eval-{name}-{stage}"
-    with _progress() as progress:
-        outcome = run(options, folder, command=_command(), csv=csv, force=force, with_vsd=vsd, progress=progress)
+    with progress_bar("count", "remaining") as update_bar:
+        outcome = run(
+            options, folder, command=_command(), csv=csv, force=force, with_vsd=vsd,
+            progress=lambda done, every: update_bar(completed=done, total=every),
+        )  # fmt: skip
     _print_results(outcome.results)
     for path in outcome.files:
         typer.echo(f"{path}")
@@ -206,18 +209,6 @@ def _noise(text: str) -> tuple[float, float, float, float]:
     except ValueError as error:
         raise ConfigError(f"--noise {text}: give four numbers, degrees and x, y, z in cm, such as 15,1,1,5.") from error
     return degrees, x, y, z
-
-
-@contextmanager
-def _progress() -> Iterator[Progress]:
-    """A bar on a terminal."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("pictures"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("pictures", total=None)
-        yield lambda done, every: bar.update(task, completed=done, total=every)
 
 
 _SHOWN = ("2deg_2cm", "5deg_5cm", "10deg_10cm", "5deg_5cm_sym", "10deg_10cm_sym", "add_01d", "adds_auc", "proj_5px",

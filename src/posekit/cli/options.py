@@ -7,12 +7,15 @@ from typing import Annotated, Literal
 
 import typer
 
+from posekit.errors import ConfigError
+
 Units = Literal["auto", "mm", "cm", "m", "in"]
 Update = Literal["auto", "correspondence", "regression"]
 Stop = Literal["angle", "fixed"]
 MaskFrom = Literal["none", "grabcut", "filled"]
 
 INPUT, LOOP, OUTPUT = "Input", "Refinement", "Output"
+SOURCES, SCHEDULE, MACHINE = "Sources", "Schedule", "Machine"  # of trainings
 NOT_RELIABLE = 3  # exit code of --require-reliable
 
 ImageArgument = Annotated[Path, typer.Argument(help="The photograph.", show_default=False)]
@@ -60,7 +63,7 @@ DetectorOption = Annotated[
     str | None,
     typer.Option(
         metavar="novel|coco|FILE",
-        help="Who looks for the object where nothing else says where it is: novel (the default) needs no training.",
+        help="Detector for an object whose place is not given: novel (the default) needs no training.",
         rich_help_panel=INPUT,
     ),
 ]
@@ -73,6 +76,10 @@ WeightsOption = Annotated[
     Path | None,
     typer.Option(metavar="FILE", help="Weights in place of the shipped ones.", rich_help_panel=LOOP),
 ]
+InitOption = Annotated[
+    Literal["templates", "mvnet"], typer.Option(help="Where first poses come from.", rich_help_panel=LOOP)
+]
+HypothesesOption = Annotated[int, typer.Option(metavar="K", help="First poses to refine.", rich_help_panel=LOOP)]
 UpdateOption = Annotated[
     Update,
     typer.Option(help="What moves the pose; auto: correspondences where the network gives them.", rich_help_panel=LOOP),
@@ -97,7 +104,7 @@ MaskEdgeOption = Annotated[
     bool,
     typer.Option(
         "--mask-edge/--no-mask-edge",
-        help="Fit the pose to the edge of the given mask, where the mask proves exact to the pixel.",
+        help="Fit the pose to the edge of the given mask, where the mask is exact to the pixel.",
         rich_help_panel=LOOP,
     ),
 ]
@@ -114,16 +121,17 @@ DeviceOption = Annotated[
     typer.Option(help="What the networks run on; auto takes a GPU where there is one.", rich_help_panel=LOOP),
 ]
 ThreadsOption = Annotated[
-    int | None, typer.Option(min=1, help="Threads of torch; by default its own choice.", rich_help_panel=LOOP)
+    int | None,
+    typer.Option(min=1, help="Threads that the networks use; by default all.", rich_help_panel=LOOP),
 ]
 
 
 def use_threads(count: int | None) -> None:
-    """Let torch use so many threads from now on in this process; its own choice where none is given."""
+    """Let the networks use so many threads from now on in this process; their own choice where none is given."""
     if count is not None:
-        import torch
+        from posekit.nets import precision
 
-        torch.set_num_threads(count)
+        precision.use_threads(count)
 
 
 FormatOption = Annotated[
@@ -171,3 +179,51 @@ JsonOption = Annotated[
         rich_help_panel=OUTPUT,
     ),
 ]
+
+# --- trainings ---
+
+TrainingOutOption = Annotated[
+    Path, typer.Option("--out", metavar="DIR", help="Folder of the weights, curves and checkpoints.")
+]
+MeshFoldersOption = Annotated[
+    list[Path] | None,
+    typer.Option("--meshes", metavar="DIR", help="A folder of meshes.", rich_help_panel=SOURCES),
+]
+MeshUnitsOption = Annotated[Units | None, typer.Option("--units", help="Of the meshes; auto.", rich_help_panel=SOURCES)]
+BackgroundsOption = Annotated[
+    Path | None,
+    typer.Option("--backgrounds", metavar="DIR", help="Photographs for backgrounds.", rich_help_panel=SOURCES),
+]
+ConfigFileOption = Annotated[
+    Path | None, typer.Option("--config", metavar="TOML", help="Everything else; options override it.")
+]
+MinutesOption = Annotated[float | None, typer.Option(help="Of wall clock.", rich_help_panel=SCHEDULE)]
+StepsOption = Annotated[int | None, typer.Option(help="Optimiser steps.", rich_help_panel=SCHEDULE)]
+RateOption = Annotated[float | None, typer.Option(help="Highest learning rate.", rich_help_panel=SCHEDULE)]
+TrainingSeedOption = Annotated[
+    int | None, typer.Option("--seed", help="The same seed gives the same result.", rich_help_panel=SCHEDULE)
+]
+DevicesOption = Annotated[int | None, typer.Option(help="Processes on this machine.", rich_help_panel=MACHINE)]
+AcceleratorOption = Annotated[
+    Literal["auto", "cpu", "cuda"] | None, typer.Option(help="What computes.", rich_help_panel=MACHINE)
+]
+RenderWorkersOption = Annotated[
+    int | None,
+    typer.Option("--workers", help="Processes that render, for each that trains.", rich_help_panel=MACHINE),
+]
+TrainingThreadsOption = Annotated[
+    int | None, typer.Option("--threads", help="Threads of torch per process.", rich_help_panel=MACHINE)
+]
+ResumeOption = Annotated[bool, typer.Option("--resume", help="Go on with the training in --out, as it was begun.")]
+
+# --- sizes ---
+
+_LONGEST_SIDE = 4096
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """(width, height) in pixels from "640x480". Raises ConfigError."""
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(part.isdecimal() and 1 <= int(part) <= _LONGEST_SIDE for part in parts):
+        raise ConfigError(f"--size {text}: give WIDTHxHEIGHT in pixels, each from 1 to {_LONGEST_SIDE}, as 640x480.")
+    return int(parts[0]), int(parts[1])

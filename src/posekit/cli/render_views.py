@@ -8,12 +8,11 @@ from typing import Annotated
 
 import typer
 
-from posekit.cli.options import ForceOption, ModelOption, UnitsOption
+from posekit.cli.options import ForceOption, ModelOption, UnitsOption, parse_size
 from posekit.errors import ConfigError
 
 _BATCH = 16  # views in memory at a time
 _MOST_VIEWS = 10_000
-_LONGEST_SIDE = 4096
 _THUMBNAIL = 240  # pixels, longer side of a picture in the contact sheet
 
 
@@ -31,7 +30,7 @@ def render_views(
     force: ForceOption = False,
 ) -> None:
     """Render a mesh from all sides: RGB, masks, a contact sheet, and each view's camera and pose."""
-    shape = _parse_size(size)
+    shape = parse_size(size)
     if not 1 <= views <= _MOST_VIEWS:
         raise ConfigError(f"--views {views}: from 1 to {_MOST_VIEWS} can be drawn.")
 
@@ -68,14 +67,6 @@ def render_views(
     folder.write("views.json", json.dumps({**about, "views": entries}, indent=1) + "\n")
     sheet = draw.grid(thumbnails, captions=[str(k) for k in range(views)])
     typer.echo(f"{views} views and {folder.write('contact_sheet.png', draw.png(sheet))}")
-
-
-def _parse_size(text: str) -> tuple[int, int]:
-    """(width, height) from "640x480". Raises ConfigError."""
-    parts = text.lower().split("x")
-    if len(parts) != 2 or not all(part.isdecimal() and 1 <= int(part) <= _LONGEST_SIDE for part in parts):
-        raise ConfigError(f"--size {text}: give WIDTHxHEIGHT in pixels, each from 1 to {_LONGEST_SIDE}, as 640x480.")
-    return int(parts[0]), int(parts[1])
 
 
 def _thumbnail_size(size: tuple[int, int]) -> tuple[int, int]:

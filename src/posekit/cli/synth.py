@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
-from posekit.cli.options import Units
+from posekit.cli.options import MACHINE, Units, parse_size
+from posekit.cli.progress import progress_bar
 from posekit.errors import ConfigError
 
-if TYPE_CHECKING:
-    from posekit.synth.run import Show
-
-WHAT, LOOK, MACHINE = "What", "Look", "Machine"
+WHAT, LOOK = "What", "Look"
 PER_OBJECT, DEFAULT = 5000, 1000  # images, the paper's for each object (section 4.1), and of other kinds
 
 
@@ -78,7 +74,6 @@ def synth(
     ] = False,
 ) -> None:
     """Make a data set of your meshes: images, depth, masks and poses in BOP layout."""
-    from posekit.cli.render_views import _parse_size
     from posekit.synth.plan import SynthConfig
     from posekit.synth.run import Machines, begin, run
 
@@ -95,28 +90,15 @@ def synth(
         objects = read_objects(given, units, symmetry)
         count = images or (PER_OBJECT * len(objects) if kind == "randomised" else DEFAULT)
         config = SynthConfig(
-            kind, count, seed, split, _parse_size(size), quality, _text(backgrounds), _text(hdri), frames, views,
+            kind, count, seed, split, parse_size(size), quality, _text(backgrounds), _text(hdri), frames, views,
             samples, variant, motion,
         )  # fmt: skip
         begin(config, out, objects)
-    with _bar() as show:
-        made = run(out, machines, show, shards)
+    with progress_bar("count", "elapsed", "remaining") as update:
+        made = run(out, machines, lambda done, total: update(completed=done, total=total), shards)
     typer.echo(f"{made} images made; data set: {out}")
     typer.echo(f"contact sheet: {out / 'contact_sheet.jpg'}\nstatistics: {out / 'statistics.json'}")
 
 
 def _text(path: Path | None) -> str:
     return "" if path is None else str(path.resolve())
-
-
-@contextmanager
-def _bar() -> Iterator[Show]:
-    """A progress bar on a terminal; elsewhere nothing."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
-
-    console = Console(stderr=True)
-    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("images", total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)

@@ -32,6 +32,7 @@ from posekit.cli.options import (
     WeightsOption,
     use_threads,
 )
+from posekit.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     from posekit.io.pose_formats import NamedPose
@@ -140,7 +141,7 @@ def track(
 
 
 class _Counts:
-    """What became of the frames."""
+    """Counts of frames and of poses."""
 
     def __init__(self) -> None:
         self.used = 0
@@ -293,13 +294,7 @@ def _recorder(path: Path, trackers: Sequence[Tracker], wanted: bool) -> Iterator
 @contextmanager
 def _bar(sequence: Frames) -> Iterator[Any]:
     """Frames a second, angle and state, live on a terminal."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-
-    console = Console(stderr=True)
-    columns = (BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=sequence.count)
+    with progress_bar("count", "text", total=sequence.count) as update:
         mean = 0.0
 
         def show(seconds: float, results: Sequence[Tracked]) -> None:
@@ -308,6 +303,6 @@ def _bar(sequence: Frames) -> Iterator[Any]:
             states = " ".join(
                 r.state if r.angle is None else f"{r.state} {math.degrees(r.angle):.1f} deg" for r in results
             )
-            bar.update(task, advance=1, description=f"{1 / max(mean, 1e-6):.1f} frames/s  {states}")
+            update(advance=1, description=f"{1 / max(mean, 1e-6):.1f} frames/s  {states}")
 
         yield show

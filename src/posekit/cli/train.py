@@ -9,14 +9,32 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from posekit.cli.options import ForceOption, Units
+from posekit.cli.options import (
+    MACHINE,
+    SCHEDULE,
+    SOURCES,
+    AcceleratorOption,
+    BackgroundsOption,
+    ConfigFileOption,
+    DevicesOption,
+    ForceOption,
+    MeshFoldersOption,
+    MeshUnitsOption,
+    MinutesOption,
+    RateOption,
+    RenderWorkersOption,
+    ResumeOption,
+    StepsOption,
+    TrainingOutOption,
+    TrainingSeedOption,
+    TrainingThreadsOption,
+)
+from posekit.cli.progress import progress_bar
 from posekit.io.files import check_writable
 
 if TYPE_CHECKING:
     from posekit.train.config import TrainConfig
     from posekit.train.loop import Show
-
-SOURCES, SCHEDULE, MACHINE = "Sources", "Schedule", "Machine"
 
 train = typer.Typer(no_args_is_help=True, help="Train networks from meshes.")
 
@@ -28,24 +46,20 @@ def _train() -> None:
 
 @train.command("pose")
 def pose(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the weights, curves and checkpoints.")],
+    out: TrainingOutOption,
     model: Annotated[
         list[Path] | None,
         typer.Option(
             "--model", "-m", metavar="MESH", help="An object to train for; repeat it.", rich_help_panel=SOURCES
         ),
     ] = None,
-    meshes: Annotated[
-        list[Path] | None, typer.Option(metavar="DIR", help="A folder of meshes.", rich_help_panel=SOURCES)
-    ] = None,
-    units: Annotated[Units | None, typer.Option(help="Of the meshes; auto.", rich_help_panel=SOURCES)] = None,
+    meshes: MeshFoldersOption = None,
+    units: MeshUnitsOption = None,
     bop: Annotated[
         list[str] | None,
         typer.Option(metavar="DIR[:SPLIT][=WEIGHT]", help="A BOP data set (paper recipe).", rich_help_panel=SOURCES),
     ] = None,
-    backgrounds: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Photographs for backgrounds.", rich_help_panel=SOURCES)
-    ] = None,
+    backgrounds: BackgroundsOption = None,
     init: Annotated[
         str | None,
         typer.Option(
@@ -62,11 +76,11 @@ def pose(
         Path | None, typer.Option(metavar="DIR", help="A BOP data set to measure on.", rich_help_panel=SOURCES)
     ] = None,
     recipe: Annotated[Literal["lite", "paper"] | None, typer.Option(help="What is trained, and how.")] = None,
-    config: Annotated[Path | None, typer.Option(metavar="TOML", help="Everything else; options override it.")] = None,
-    minutes: Annotated[float | None, typer.Option(help="Of wall clock.", rich_help_panel=SCHEDULE)] = None,
-    steps: Annotated[int | None, typer.Option(help="Optimiser steps.", rich_help_panel=SCHEDULE)] = None,
+    config: ConfigFileOption = None,
+    minutes: MinutesOption = None,
+    steps: StepsOption = None,
     batch: Annotated[int | None, typer.Option(help="Samples per process and step.", rich_help_panel=SCHEDULE)] = None,
-    rate: Annotated[float | None, typer.Option(help="Highest learning rate.", rich_help_panel=SCHEDULE)] = None,
+    rate: RateOption = None,
     mvnet: Annotated[
         int | None,
         typer.Option(
@@ -76,29 +90,21 @@ def pose(
             rich_help_panel=SCHEDULE,
         ),
     ] = None,
-    seed: Annotated[
-        int | None, typer.Option(help="The same seed gives the same result.", rich_help_panel=SCHEDULE)
-    ] = None,
+    seed: TrainingSeedOption = None,
     overfit: Annotated[
         bool, typer.Option("--overfit", help="Train on one batch only.", rich_help_panel=SCHEDULE)
     ] = False,
-    devices: Annotated[int | None, typer.Option(help="Processes on this machine.", rich_help_panel=MACHINE)] = None,
+    devices: DevicesOption = None,
     num_nodes: Annotated[int | None, typer.Option(help="Machines.", rich_help_panel=MACHINE)] = None,
-    accelerator: Annotated[
-        Literal["auto", "cpu", "cuda"] | None, typer.Option(help="What computes.", rich_help_panel=MACHINE)
-    ] = None,
+    accelerator: AcceleratorOption = None,
     precision: Annotated[
         Literal["auto", "32-true", "bf16-mixed", "16-mixed"] | None,
         typer.Option(help="Of numbers.", rich_help_panel=MACHINE),
     ] = None,
-    workers: Annotated[
-        int | None, typer.Option(help="Processes that render, for each that trains.", rich_help_panel=MACHINE)
-    ] = None,
-    threads: Annotated[int | None, typer.Option(help="Threads of torch per process.", rich_help_panel=MACHINE)] = None,
+    workers: RenderWorkersOption = None,
+    threads: TrainingThreadsOption = None,
     profile: Annotated[bool, typer.Option("--profile", help="Write profile.txt.", rich_help_panel=MACHINE)] = False,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with the training in --out, as it was begun.")
-    ] = False,
+    resume: ResumeOption = False,
     force: ForceOption = False,
 ) -> None:
     """Train the pose networks on renderings of your meshes, or of procedural shapes where none are given."""
@@ -137,12 +143,16 @@ def angle(
     ] = None,
     preset: Annotated[Literal["lite", "paper"], typer.Option(help="The networks.")] = "lite",
     model: Annotated[
-        list[Path] | None, typer.Option("--model", "-m", metavar="MESH", help="An object; repeat it.")
+        list[Path] | None,
+        typer.Option("--model", "-m", metavar="MESH", help="An object; repeat it.", rich_help_panel=SOURCES),
     ] = None,
-    meshes: Annotated[list[Path] | None, typer.Option(metavar="DIR", help="A folder of meshes.")] = None,
-    share: Annotated[float, typer.Option(min=0, max=1, help="Of the meshes; the rest is procedural.")] = 1.0,
-    units: Annotated[Units, typer.Option(help="Of the meshes.")] = "auto",
-    backgrounds: Annotated[Path | None, typer.Option(metavar="DIR", help="Photographs for backgrounds.")] = None,
+    meshes: MeshFoldersOption = None,
+    share: Annotated[
+        float,
+        typer.Option(min=0, max=1, help="Of the meshes; the rest is procedural.", rich_help_panel=SOURCES),
+    ] = 1.0,
+    units: MeshUnitsOption = None,
+    backgrounds: BackgroundsOption = None,
     cases: Annotated[int, typer.Option(min=1, help="Renderings to refine.")] = 240,
 ) -> None:
     """Fit the predicted angle alone to what refinement leaves; `train pose` does so at its end."""
@@ -215,48 +225,40 @@ def _report(rows: list[dict[str, str]]) -> str:
 
 @contextmanager
 def _bar() -> Iterator[Show]:
-    """A progress bar on a terminal; elsewhere nothing."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-    columns = (BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn(), TimeRemainingColumn())
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("starting", total=1.0)
+    """The share of the training that is done, its step and its loss."""
+    with progress_bar("text", "elapsed", "remaining", total=1.0, text="starting") as update:
 
         def show(progress: Any) -> None:
             loss = progress.values.get("loss", float("nan"))
             told = progress.label or f"step {progress.step}, loss {loss:.3f}"
-            bar.update(task, completed=progress.done, description=told)
+            update(completed=progress.done, description=told)
 
         yield show
 
 
 @train.command("detector")
 def detector(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the weights, curves and checkpoints.")],
+    out: TrainingOutOption,
     models: Annotated[
         list[Path] | None,
         typer.Option(
             "--models", "--model", "-m", metavar="MESH", help="What to find; repeat it.", rich_help_panel=SOURCES
         ),
     ] = None,
-    meshes: Annotated[
-        list[Path] | None, typer.Option(metavar="DIR", help="A folder of meshes.", rich_help_panel=SOURCES)
-    ] = None,
+    meshes: MeshFoldersOption = None,
     agnostic: Annotated[
         bool, typer.Option("--agnostic", help="Objects of any kind, as one class.", rich_help_panel=SOURCES)
     ] = False,
     distractors: Annotated[
         list[Path] | None,
         typer.Option(
-            metavar="DIR", help="A folder of meshes that lie about, not to be found.", rich_help_panel=SOURCES
+            metavar="DIR",
+            help="A folder of further meshes for the scenes, not to be detected.",
+            rich_help_panel=SOURCES,
         ),
     ] = None,
-    units: Annotated[Units | None, typer.Option(help="Of the meshes; auto.", rich_help_panel=SOURCES)] = None,
-    backgrounds: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Photographs for backgrounds.", rich_help_panel=SOURCES)
-    ] = None,
+    units: MeshUnitsOption = None,
+    backgrounds: BackgroundsOption = None,
     init: Annotated[
         str | None,
         typer.Option(
@@ -264,29 +266,21 @@ def detector(
         ),
     ] = None,
     backbone: Annotated[Literal["lite0", "resnet50"] | None, typer.Option(help="Light, or the paper's.")] = None,
-    config: Annotated[Path | None, typer.Option(metavar="TOML", help="Everything else; options override it.")] = None,
-    minutes: Annotated[float | None, typer.Option(help="Of wall clock.", rich_help_panel=SCHEDULE)] = None,
+    config: ConfigFileOption = None,
+    minutes: MinutesOption = None,
     epochs: Annotated[int | None, typer.Option(help="Of 2000 scenes.", rich_help_panel=SCHEDULE)] = None,
-    steps: Annotated[int | None, typer.Option(help="Optimiser steps.", rich_help_panel=SCHEDULE)] = None,
+    steps: StepsOption = None,
     batch: Annotated[int | None, typer.Option(help="Scenes per process and step.", rich_help_panel=SCHEDULE)] = None,
-    rate: Annotated[float | None, typer.Option(help="Highest learning rate.", rich_help_panel=SCHEDULE)] = None,
-    seed: Annotated[
-        int | None, typer.Option(help="The same seed gives the same result.", rich_help_panel=SCHEDULE)
-    ] = None,
-    devices: Annotated[int | None, typer.Option(help="Processes on this machine.", rich_help_panel=MACHINE)] = None,
-    accelerator: Annotated[
-        Literal["auto", "cpu", "cuda"] | None, typer.Option(help="What computes.", rich_help_panel=MACHINE)
-    ] = None,
+    rate: RateOption = None,
+    seed: TrainingSeedOption = None,
+    devices: DevicesOption = None,
+    accelerator: AcceleratorOption = None,
     precision: Annotated[
         Literal["32-true", "bf16-mixed", "16-mixed"] | None, typer.Option(help="Of numbers.", rich_help_panel=MACHINE)
     ] = None,
-    workers: Annotated[
-        int | None, typer.Option(help="Processes that render, for each that trains.", rich_help_panel=MACHINE)
-    ] = None,
-    threads: Annotated[int | None, typer.Option(help="Threads of torch per process.", rich_help_panel=MACHINE)] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with the training in --out, as it was begun.")
-    ] = False,
+    workers: RenderWorkersOption = None,
+    threads: TrainingThreadsOption = None,
+    resume: ResumeOption = False,
     force: ForceOption = False,
 ) -> None:
     """Train Mask R-CNN on composed scenes: for your meshes, or with --agnostic for objects of any kind."""
@@ -317,7 +311,7 @@ def detector(
             rows = train_detector(changed(chosen, _given(asked), "the command line"), out, show, force)
     if rows:
         typer.echo(_detector_report(rows))
-        typer.echo(f"weights: {out}; use them with: posekit detect IMAGE --weights {out}")
+        typer.echo(f"weights: {out}; use them with: posekit detect IMAGE --detector {out}")
 
 
 def _detector_report(rows: list[dict[str, str]]) -> str:

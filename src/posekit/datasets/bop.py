@@ -89,7 +89,7 @@ class BopDataset:
     (``scene_camera_photoneo.json``, ``rgb_photoneo/``); the only sensor needs no name. targets: a test's list of
     images and objects, by default the first ``SPLIT_targets_*.json`` (bop19 before others) in the folder; where there
     is one, `images` and `instances` keep to it. Pass ``targets=None`` to see everything. units: of the meshes; auto is
-    BOP's mm, or what the stated diameter tells. Raises InputError where the layout is not there.
+    BOP's mm, or what fits the stated diameter. Raises InputError where the layout is not there.
     """
 
     def __init__(
@@ -342,7 +342,7 @@ def _check_millimetres(path: Path, truths: Mapping[int, Any]) -> None:
     try:
         far = [math.hypot(*map(float, truth["cam_t_m2c"])) for entries in truths.values() for truth in entries]
     except (KeyError, TypeError, ValueError, OverflowError):
-        return  # told where the entry is read
+        return  # reported where the entry is read
     if far and max(far) < _NEAREST_MM:
         raise InputError(
             f"{path}: cam_t_m2c is in mm, and its objects would be at most {max(far):.3g} mm from the camera: it seems "
@@ -396,17 +396,17 @@ def _stated(info: Path, obj_id: int) -> float | None:
 
 
 def _diameter(info: Path, obj_id: int, model: ObjectModel) -> float:
-    """Metres, as the data set states it, else measured; measured too, and told, where it was stated in metres. Raises
+    """Metres, as the data set states it, else measured; measured too, and logged, where it was stated in metres. Raises
     InputError where what is stated is no length."""
     stated = _stated(info, obj_id)
-    if stated is not None and _alike(stated, model.diameter):
+    if stated is not None and _same_diameter(stated, model.diameter):
         log.warning("%s: the diameter %g of object %d is in metres, not in BOP's mm; it is measured.", info, stated,
                     obj_id)  # fmt: skip
         stated = None
     return model.diameter if stated is None else stated / 1000.0
 
 
-def _alike(a: float, b: float) -> bool:
+def _same_diameter(a: float, b: float) -> bool:
     """Diameters of one object, measured by two programs."""
     return 0.95 < a / b < 1.05
 
@@ -428,7 +428,7 @@ def _meshes(folder: Path) -> dict[int, Path]:
 
 
 def _mesh(path: Path, stated: float | None) -> ObjectModel:
-    """A mesh in BOP's millimetres; in another unit, which is told, where that alone gives an object or the stated
+    """A mesh in BOP's millimetres; in another unit, which is logged, where that alone gives an object or the stated
     diameter (mm, None where nothing states it). Raises MeshError."""
     found: dict[str, ObjectModel] = {}
     for unit in ("mm", "m", "cm", "in"):
@@ -438,9 +438,9 @@ def _mesh(path: Path, stated: float | None) -> ObjectModel:
             if "posekit works" not in str(error):
                 raise
             reason = str(error).partition("; posekit works")[0]
-        if unit == "mm" and unit in found and (stated is None or _alike(1000 * found[unit].diameter, stated)):
+        if unit == "mm" and unit in found and (stated is None or _same_diameter(1000 * found[unit].diameter, stated)):
             break  # as it is meant
-    fitting = [u for u, m in found.items() if stated is not None and _alike(1000 * m.diameter, stated)]
+    fitting = [u for u, m in found.items() if stated is not None and _same_diameter(1000 * m.diameter, stated)]
     chosen = next(iter(fitting or [u for u in ("mm", "m") if u in found]), None)
     if chosen is None:
         raise MeshError(
@@ -452,7 +452,7 @@ def _mesh(path: Path, stated: float | None) -> ObjectModel:
     if chosen != "mm":
         log.warning("%s: BOP's meshes are in mm, which would make it %.3g mm long; it is taken for %s, %.4g mm long.",
                     path.name, inside / (1000 * UNITS[chosen]), _UNIT_NAMES[chosen], inside)  # fmt: skip
-    elif stated is not None and not fitting and not _alike(model.diameter, stated):
+    elif stated is not None and not fitting and not _same_diameter(model.diameter, stated):
         log.warning("%s: it is %.4g mm long, and models_info.json says %.4g: measures use the latter.", path.name,
                     inside, stated)  # fmt: skip
     elif stated is None and inside < _DOUBTFUL_MM:

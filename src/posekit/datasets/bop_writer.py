@@ -73,8 +73,8 @@ class BopWriter:
     # --- images ---
 
     def write(self, scene: int, image: int, picture: Picture) -> None:
-        """One image with all that belongs to it. Raises OutputError where the disk refuses, InputError where arrays
-        do not fit together."""
+        """One image with all that belongs to it. Raises OutputError where a file cannot be written, InputError where
+        arrays do not fit together."""
         _check(picture)
         folder, name = self.folder / f"{scene:06d}", f"{image:06d}"
         files = {f"rgb/{name}.{'png' if self.quality is None else 'jpg'}": _rgb(picture.image, self.quality)}

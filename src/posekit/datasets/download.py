@@ -31,7 +31,7 @@ def download(info: DatasetInfo, folder: Path, *, endpoint: str | None = None, ke
     """Fetch and unpack a data set's archives into ``folder / info.below``.
 
     endpoint: of the hub; its own (or ``$HF_ENDPOINT``) where not given. keep: leave the archives in place.
-    An interrupted download goes on where it stopped, finished archives are not fetched again. Each archive's SHA-256
+    An interrupted download is resumed, finished archives are not fetched again. Each archive's SHA-256
     is compared with the one that the hub states.
     Raises InputError where the hub cannot be reached or a file is damaged, OutputError where it cannot be written.
     """

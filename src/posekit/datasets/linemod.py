@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from abc import ABC, abstractmethod
 from functools import cached_property
 from pathlib import Path
 
@@ -97,7 +98,38 @@ def _listed(path: Path) -> set[int]:
     return frames
 
 
-class LinemodDataset(BopDataset):
+class _TestShare(ABC):
+    """What both readers have in common: 13 objects with a sequence each, of which the frames of the split's test share
+    are shown."""
+
+    _kept: list[int]  # numbers of the scenes, each that of its object
+
+    @property
+    @abstractmethod
+    def frames(self) -> _Split:
+        """Which frames of each object are the test."""
+
+    @property
+    def split_label(self) -> str:
+        """Where the split comes from, for a person."""
+        return self.frames.label
+
+    @property
+    def split_hash(self) -> str:
+        """16 hexadecimal digits that name the split."""
+        return self.frames.digest
+
+    def scenes(self) -> list[int]:
+        """Numbers of the scenes, each that of its object."""
+        return self._kept
+
+    def images(self, scene: int | None = None) -> list[tuple[int, int]]:
+        """(scene, image) of the test's frames, of one scene or of all."""
+        scenes = self._kept if scene is None else [scene]
+        return [(s, image) for s in scenes for image in self.frames.test[s]]
+
+
+class LinemodDataset(_TestShare, BopDataset):
     """LINEMOD in BOP layout (``lm``), 13 objects, the frames of the split's test share.
 
     A scene holds one object's sequence and has its number; other objects annotated in it are left out.
@@ -105,7 +137,7 @@ class LinemodDataset(BopDataset):
 
     def __init__(self, root: str | Path, split: str = "test") -> None:
         super().__init__(root, split, targets=None)
-        self._kept = [s for s in super().scenes() if s in CLASSES]
+        self._kept = [s for s in BopDataset.scenes(self) if s in CLASSES]
         if not self._kept:
             raise InputError(
                 f"{self.root / split} has none of LINEMOD's 13 sequences (000001 is the ape's, and so on)."
@@ -113,10 +145,11 @@ class LinemodDataset(BopDataset):
 
     @cached_property
     def frames(self) -> _Split:
+        """Which frames of each object are the test; where no list says so, the annotated rotations do."""
         frames, rotations = {}, {}
         for scene in self._kept:
             poses = {}
-            for _, image in super().images(scene):
+            for _, image in BopDataset.images(self, scene):
                 found = [i for i in super().instances(scene, image, every=True) if i.obj_id == scene]
                 if found:
                     poses[image] = found[0].T_cam_obj.R
@@ -124,22 +157,8 @@ class LinemodDataset(BopDataset):
             rotations[scene] = np.array(list(poses.values()))
         return _Split(self.root, frames, rotations)
 
-    @property
-    def split_label(self) -> str:
-        return self.frames.label
-
-    @property
-    def split_hash(self) -> str:
-        return self.frames.digest
-
-    def scenes(self) -> list[int]:
-        return self._kept
-
-    def images(self, scene: int | None = None) -> list[tuple[int, int]]:
-        scenes = self._kept if scene is None else [scene]
-        return [(s, image) for s in scenes for image in self.frames.test[s]]
-
     def instances(self, scene: int, image: int, every: bool = False) -> list[Instance]:
+        """The scene's own object in a picture; every: all that are annotated. Poses ``T_cam_obj`` in metres."""
         found = super().instances(scene, image, every)
         return found if every else [i for i in found if i.obj_id == scene]
 
@@ -149,7 +168,7 @@ def is_deepim(root: Path) -> bool:
     return (root / "data" / "observed").is_dir()
 
 
-class DeepimDataset:
+class DeepimDataset(_TestShare):
     """LINEMOD as DeepIM's scripts convert it: ``data/observed/06/000001-color.png`` (and -depth, -label),
     ``data/gt_observed/cat/000001-pose.txt`` (or beside the photograph), ``models/cat/textured.obj`` in metres.
 
@@ -170,6 +189,7 @@ class DeepimDataset:
 
     @cached_property
     def frames(self) -> _Split:
+        """Which frames of each object are the test; where no list says so, the annotated rotations do."""
         numbers = {
             o: sorted(int(p.name.split("-")[0]) for p in (self._observed / f"{o:02d}").glob("*-color.png"))
             for o in self._kept
@@ -177,15 +197,8 @@ class DeepimDataset:
         rotations = {o: np.array([self._pose(o, f).R for f in frames]) for o, frames in numbers.items()}
         return _Split(self.root, numbers, rotations)
 
-    @property
-    def split_label(self) -> str:
-        return self.frames.label
-
-    @property
-    def split_hash(self) -> str:
-        return self.frames.digest
-
     def model_ids(self) -> list[int]:
+        """Numbers of the objects that this copy has."""
         return self._kept
 
     def model(self, obj_id: int) -> ObjectModel:
@@ -202,31 +215,30 @@ class DeepimDataset:
         return self._loaded[obj_id]
 
     def measured_model(self, obj_id: int) -> MeasuredModel:
+        """The object with its mesh's own diameter, metres. Raises MeshError where there is no mesh."""
         model = self.model(obj_id)
         return MeasuredModel(model, model.diameter)
 
-    def scenes(self) -> list[int]:
-        return self._kept
-
-    def images(self, scene: int | None = None) -> list[tuple[int, int]]:
-        scenes = self._kept if scene is None else [scene]
-        return [(s, image) for s in scenes for image in self.frames.test[s]]
-
     def view(self, scene: int, image: int) -> View:
+        """A frame with LINEMOD's camera. Raises ImageError where the picture is missing or damaged."""
         pixels = load_image(self.image_path(scene, image))
         return View(pixels, self.camera(scene, image, (pixels.shape[1], pixels.shape[0])))
 
     def image_path(self, scene: int, image: int) -> Path:
+        """The file of a frame's colours."""
         return self._observed / f"{scene:02d}" / f"{image:06d}-color.png"
 
     def picture_size(self, scene: int, image: int) -> tuple[int, int]:
+        """(width, height) in pixels. Raises ImageError where the picture is missing or damaged."""
         pixels = load_image(self.image_path(scene, image))
         return pixels.shape[1], pixels.shape[0]
 
     def camera(self, _scene: int, _image: int, size: tuple[int, int]) -> Camera:
+        """LINEMOD's camera, the same for all frames; size: (width, height) in pixels."""
         return Camera.from_K(_LINEMOD_K, *size)
 
     def depth(self, scene: int, image: int) -> NDArray[np.float32] | None:
+        """float32 (H, W), metres, 0 where it was not measured; None where the copy has none. Raises ImageError."""
         path = self._observed / f"{scene:02d}" / f"{image:06d}-depth.png"
         if not path.is_file():
             return None
@@ -236,6 +248,7 @@ class DeepimDataset:
         return np.asarray(raw, dtype=np.float32) / np.float32(1000.0)
 
     def instances(self, scene: int, image: int, every: bool = False) -> list[Instance]:  # noqa: ARG002
+        """The one object of a frame, ``T_cam_obj`` in metres; ``every`` changes nothing. Raises InputError."""
         mask_path = self._observed / f"{scene:02d}" / f"{image:06d}-label.png"
         return [DeepimInstance(scene, image, 0, scene, self._pose(scene, image), None, None, np.nan, mask_path)]
 
@@ -257,6 +270,7 @@ class DeepimInstance(Instance):
     """An instance whose mask is a label picture: the object's pixels hold its number."""
 
     def mask(self) -> NDArray[np.bool_]:
+        """Its visible pixels, bool (H, W). Raises ImageError where the file is missing or damaged."""
         raw = cv2.imread(str(self.mask_path), cv2.IMREAD_UNCHANGED)
         if raw is None:
             raise ImageError(f"the label picture {self.mask_path} is missing or damaged: copy it again.")

@@ -40,6 +40,7 @@ class DatasetInfo:
         return self.folder or self.name
 
     def label(self, obj_id: int) -> str:
+        """An object's name, or "object N" where it has none."""
         return self.names.get(obj_id, f"object {obj_id}")
 
     def number(self, name: str) -> int:
@@ -143,7 +144,7 @@ def find_root(info: DatasetInfo, root: Path | None) -> Path:
 
 
 def own_names(root: Path) -> dict[int, str]:
-    """The names of a synthetic data set's objects, by number; empty where it tells none. Raises InputError."""
+    """The names of a synthetic data set's objects, by number; empty where it has none. Raises InputError."""
     path = root / NAMES
     if not path.is_file():
         return {}

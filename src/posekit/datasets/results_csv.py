@@ -1,5 +1,5 @@
 """Files that others make: BOP's results CSV, refused with the line where anything is wrong, as BOP's server does, and
-detections JSON, whose bad entries are skipped and told."""
+detections JSON, whose bad entries are skipped and logged."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from posekit.io.files import read_text
 COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 _LOOSE = 0.01  # how far R R^T may be from the identity: files are rounded
 _SAME_TIME = 1e-3  # seconds
-_TOLD = 10  # skipped entries of a file that are told one by one
+_MOST_LOGGED = 10  # skipped entries of a file that are logged one by one
 
 log = logging.getLogger("posekit")
 
@@ -199,7 +199,7 @@ def read_detections(
 ) -> dict[tuple[int, int], list[FoundRegion]]:
     """Read a BOP detections file, by picture. known: the data set's pictures; objects: its object numbers.
 
-    Entries that cannot be used are skipped, and told with their line and the reason. Raises InputError where the file
+    Entries that cannot be used are skipped, and logged with their line and the reason. Raises InputError where the file
     is no list of entries, or has some and none that can be used.
     """
     found: dict[tuple[int, int], list[FoundRegion]] = {}
@@ -221,7 +221,7 @@ class _Unusable(Exception):
 
 
 class _Skipped:
-    """Tells of the entries of a file that are skipped: the first ones each, the others by their number."""
+    """Logs the entries of a file that are skipped: the first ones each, the others by their number."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.count, self.first = path, 0, ""
@@ -229,12 +229,12 @@ class _Skipped:
     def tell(self, line: int, reason: str) -> None:
         self.count += 1
         self.first = self.first or f"line {line}: {reason}"
-        if self.count <= _TOLD:
+        if self.count <= _MOST_LOGGED:
             log.warning("%s, line %d: the entry is skipped: %s.", self.path, line, reason)
 
     def end(self, used: int) -> None:
         """used: entries that are left. Raises InputError where there are none but skipped ones."""
-        if self.count > _TOLD:
+        if self.count > _MOST_LOGGED:
             log.warning("%s: %d entries in all are skipped, %d are used.", self.path, self.count, used)
         if not self.count and not used:
             log.warning("%s holds no detections at all.", self.path)

@@ -1,4 +1,4 @@
-"""Symmetries found by looking: does a mesh look the same after a turn about one of its axes?"""
+"""Symmetries found by comparing renderings: does a mesh look the same after a turn about one of its axes?"""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ VIEWS, SIDE = 8, 96  # pictures that are compared, their sides in pixels
 DEPTH = 0.02  # of the diameter: deeper differences count
 PIXELS, COLOUR = 0.03, 12.0  # largest share of pixels that differ, and largest mean difference of colour
 ORDERS = (12, 8, 6, 5, 4, 3, 2)
-ANYHOW = (0.31, 1.0, 2.43)  # turns (radians) that only a body of revolution survives
+ARBITRARY_TURNS = (0.31, 1.0, 2.43)  # turns (radians) after which only a body of revolution looks the same
 
 
 def detect_symmetries(renderer: Renderer, model: ObjectModel) -> Symmetries:
-    """Turns about lines along the mesh's x, y and z through its box's centre that nobody sees, in shape or colour.
+    """Turns about lines along the mesh's x, y and z through its box's centre that change neither the rendered shape nor
+    the colours.
 
     Other axes and mirrors are not looked for: give such symmetries in a models_info.json.
     """
@@ -33,9 +34,9 @@ def detect_symmetries(renderer: Renderer, model: ObjectModel) -> Symmetries:
 
         def holds(angle: float, axis: np.ndarray = axis) -> bool:
             turned = [pose @ Pose.rotation(so3_exp(axis * angle)) for pose in poses]
-            return _alike(before, _seen(renderer, model, turned, camera), DEPTH * model.diameter)
+            return _same_appearance(before, _seen(renderer, model, turned, camera), DEPTH * model.diameter)
 
-        if all(holds(angle) for angle in ANYHOW):
+        if all(holds(angle) for angle in ARBITRARY_TURNS):
             items.append(f"{name}:inf")
         else:
             items += [f"{name}:{n}" for n in ORDERS if holds(2 * np.pi / n)][:1]
@@ -47,7 +48,7 @@ def _seen(renderer: Renderer, model: ObjectModel, poses: list[Pose], camera: Cam
     return renderer.render(model, [pose @ model.T_ctr_obj for pose in poses], camera, light=None)
 
 
-def _alike(before: list[View], after: list[View], depth: float) -> bool:
+def _same_appearance(before: list[View], after: list[View], depth: float) -> bool:
     differing = total = 0
     colours: list[float] = []
     for a, b in zip(before, after, strict=True):

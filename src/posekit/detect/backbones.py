@@ -43,6 +43,7 @@ class InvertedResidual(nn.Module):
         self.residual = stride == 1 and inputs == outputs
 
     def forward(self, x: Tensor) -> Tensor:
+        """(B, cin, H, W) -> (B, cout, H / stride, W / stride)."""
         out: Tensor = self.layers(x)
         return x + out if self.residual else out
 

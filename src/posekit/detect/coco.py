@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
+import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -52,6 +55,65 @@ def average_precision(truths: Sequence[Truth], found: Sequence[Found]) -> dict[s
     for kind, name in (("bbox", "box"), ("segm", "mask")):
         out[f"{name}_ap"], out[f"{name}_ap50"] = _evaluate(annotations, results, sizes, kind)
     return out
+
+
+@dataclass(frozen=True, eq=False)
+class Overlaps:
+    """Detections and instances of one class in one picture. scores: (D,). ignored: (G,), True where finding an
+    instance counts neither for nor against. iou: (D, G), of boxes or of masks."""
+
+    scores: NDArray[np.float64]
+    ignored: NDArray[np.bool_]
+    iou: NDArray[np.float64]
+
+
+def average_precision_of_overlaps(pictures: Sequence[Overlaps]) -> tuple[float, float]:
+    """COCO's AP and AP50 of one class by pycocotools, in [0, 1], from overlaps that are known; 100 detections of a
+    picture count. Unlike COCO's crowds, an ignored instance excuses one detection only, as the BOP challenge has it.
+    NaN where there is nothing to be found."""
+    if all(each.ignored.all() for each in pictures):
+        return math.nan, math.nan
+    evaluation = _KnownOverlaps(pictures)
+    evaluation.evaluate()
+    evaluation.accumulate()
+    precision = evaluation.eval["precision"][:, :, 0, 0, 0]  # (thresholds, recalls)
+    return float(precision.mean()), float(precision[0].mean())
+
+
+class _KnownOverlaps(COCOeval):  # type: ignore[misc]
+    """pycocotools' evaluation with overlaps that are given instead of computed."""
+
+    def __init__(self, pictures: Sequence[Overlaps]) -> None:
+        super().__init__(iouType="bbox")
+        self.pictures = pictures
+        self.params.imgIds, self.params.catIds = list(range(len(pictures))), [1]
+        self.params.areaRng, self.params.areaRngLbl, self.params.maxDets = [[0, 1e10]], ["all"], [100]
+
+    def evaluate(self) -> None:
+        """As COCOeval, which prints."""
+        with contextlib.redirect_stdout(io.StringIO()):
+            super().evaluate()
+
+    def accumulate(self, p: Any = None) -> None:
+        """As COCOeval, which prints."""
+        with contextlib.redirect_stdout(io.StringIO()):
+            super().accumulate(p)
+
+    def _prepare(self) -> None:
+        self._gts: dict[Any, Any] = defaultdict(list)
+        self._dts: dict[Any, Any] = defaultdict(list)
+        number = itertools.count(1)  # 0 means "not matched"
+        for image, here in enumerate(self.pictures):
+            common = {"area": 1.0, "iscrowd": 0}
+            self._gts[image, 1] = [{**common, "id": next(number), "ignore": int(v)} for v in here.ignored]
+            self._dts[image, 1] = [{**common, "id": next(number), "score": float(v)} for v in here.scores]
+        self.evalImgs: dict[Any, Any] = defaultdict(list)
+        self.eval: dict[str, Any] = {}
+
+    def computeIoU(self, imgId: int, catId: int) -> NDArray[np.float64]:  # noqa: ARG002
+        """(D, G), detections by falling score."""
+        here = self.pictures[imgId]
+        return here.iou[np.argsort(-here.scores, kind="mergesort")[: self.params.maxDets[-1]]]
 
 
 def _evaluate(

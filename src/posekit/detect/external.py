@@ -22,7 +22,7 @@ from posekit.view import View
 
 log = logging.getLogger("posekit")
 
-_BEYOND = 1.1  # of a picture's side: a box that ends further out is no width and height
+_BEYOND = 1.1  # of a picture's side: a box that ends further out was not given by width and height
 
 _FORMS = (
     "a list of {image_id, category_id, score, bbox: [x, y, width, height], segmentation} as BOP and COCO results have "
@@ -43,7 +43,7 @@ class DetectionsFile:
         """The entries for a photograph: its number is the last one in its name, as BOP has it; a file about one picture
         only is taken to be about this one. Of several scenes the one of the picture's folder counts.
 
-        Entries that cannot be used are skipped and told. Raises PromptError where the file is no detections, or has
+        Entries that cannot be used are skipped and logged. Raises PromptError where the file is no detections, or has
         none for this picture, and says which pictures it has.
         """
         try:
@@ -86,7 +86,7 @@ class DetectionsFile:
                 log.warning("%s", text)
             chosen = [(k, e) for k, e in enumerate(self.entries) if int(e["category_id"]) in wanted]
             corners = self._corners(view)
-            mine = [d for k, e in chosen if (d := self._told(k, e, view, model, corners)) is not None]
+            mine = [d for k, e in chosen if (d := self._usable_detection(k, e, view, model, corners)) is not None]
             if chosen and not mine:
                 raise PromptError(f"{self.label}: none of its {len(chosen)} detections of {model.name} can be used.")
             found += sorted(mine, key=lambda d: -d.score)
@@ -96,14 +96,14 @@ class DetectionsFile:
         return ", ".join(f"{n} ({self.names[n]})" if n in self.names else str(n) for n in sorted(numbers))
 
     def _corners(self, view: View) -> bool:
-        """Whether all boxes of the picture are x0, y0, x1, y1, which is told."""
+        """Whether all boxes of the picture are x0, y0, x1, y1, which is logged."""
         size = (view.camera if view.lens is None else view.lens.camera).size
         return are_corners([e["bbox"] for e in self.entries if _four(e.get("bbox"))], size, self.label)
 
-    def _told(
+    def _usable_detection(
         self, k: int, entry: Mapping[str, Any], view: View, model: ObjectModel, corners: bool
     ) -> Detection | None:
-        """The detection, or None where it cannot be used, which is told."""
+        """The detection, or None where it cannot be used, which is logged."""
         try:
             return self._detection(entry, view, model, corners)
         except PromptError as error:
@@ -154,7 +154,7 @@ def _parts(data: Any) -> tuple[list[Any], dict[int, str], dict[int, str]]:
 
 
 def _usable(entry: Any, k: int, label: str) -> bool:
-    """Whether an entry names its picture and its category; told where not."""
+    """Whether an entry names its picture and its category; logged where not."""
     try:
         int(entry["category_id"]), int(entry["image_id"])
         if entry.get("scene_id") is not None:
@@ -213,8 +213,8 @@ def model_number(name: str) -> int | None:
 
 
 def are_corners(boxes: Sequence[Sequence[float]], size: tuple[int, int], label: str) -> bool:
-    """Whether boxes that should be x, y, width, height are x0, y0, x1, y1, which is told: so all lie within the picture
-    (size: its width, height), and some do not as the former. label: of the file."""
+    """Whether boxes that should be x, y, width, height are x0, y0, x1, y1, which is logged: so all lie within the
+    picture (size: its width, height), and some do not as the former. label: of the file."""
     width, height = size
     inside = all(x0 < x1 <= width + 1 and y0 < y1 <= height + 1 for x0, y0, x1, y1 in boxes)
     beyond = any(x + w > _BEYOND * width or y + h > _BEYOND * height for x, y, w, h in boxes)

@@ -18,6 +18,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
+from posekit.camera import box_iou
 from posekit.detect.backbones import BACKBONES, LITE0_MEAN, LITE0_STD, feature_pyramid
 from posekit.detect.sharpen import sharpened
 from posekit.detect.vision import torchvision
@@ -47,7 +48,7 @@ class MaskRCNNConfig:
     """The network of a detector and how it is used."""
 
     backbone: str = "lite0"  # "lite0" or "resnet50"
-    classes: tuple[str, ...] = NOVEL  # names, without the ground
+    classes: tuple[str, ...] = NOVEL  # names, without the background
     size: tuple[int, int] = (320, 240)  # (width, height) that pictures are fitted into in training
     use_size: tuple[int, int] = (480, 360)  # the same in use; small objects want it larger
     channels: int = 64  # of the pyramid
@@ -206,7 +207,7 @@ def _load_strictly(network: nn.Module, state: Mapping[str, Tensor], file: Path) 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What the network says about a picture: boxes (N, 4), edges; labels (N,), numbers of classes from 0; scores (N,);
+    """What the network finds in a picture: boxes (N, 4), edges; labels (N,), numbers of classes from 0; scores (N,);
     masks bool (N, H, W). By falling score."""
 
     boxes: NDArray[np.float64]
@@ -264,7 +265,7 @@ def find_augmented(
     boxes, labels, scores, masks = (
         np.concatenate([getattr(found, name) for found in seen]) for name in ("boxes", "labels", "scores", "masks")
     )
-    overlaps = torchvision().ops.box_iou(torch.from_numpy(boxes), torch.from_numpy(boxes)).numpy()
+    overlaps = box_iou(boxes[:, None], boxes[None])
     order, groups = np.argsort(-scores, kind="stable"), []
     while len(order):
         same = (overlaps[order[0], order] > SAME) & (labels[order] == labels[order[0]])

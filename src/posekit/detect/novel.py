@@ -3,12 +3,11 @@
 A class-agnostic Mask R-CNN proposes instances of anything, in more than one size of the picture. Each is
 compared with the mesh: by ImageNet's features over the silhouette, by their median chroma, and, the likeliest,
 by the template search that also gives first poses (silhouette and normalised colour).
-docs/decisions tells what each is worth.
+What each contributes is measured in docs/decisions.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,11 +19,12 @@ import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 
-from posekit.camera import Box, Camera, box_overlap
+from posekit.camera import Box, Camera, box_iou, mask_iou
 from posekit.detect import Detector
 from posekit.detect.backbones import LITE0_MEAN, LITE0_STD, Lite0, lite0_imagenet, load_lite0
 from posekit.detect.maskrcnn import COCO, DOUBTFUL, SHIPPED, MaskRCNN, TrainedDetector, find, load_coco, load_detector
 from posekit.detect.sharpen import sharpened
+from posekit.detect.similarity import with_similarity
 from posekit.detect.vision import torchvision
 from posekit.errors import ConfigError
 from posekit.first_pose.features import FeatureSearch
@@ -42,15 +42,14 @@ ANY = "novel"  # the name of the shipped detector
 SIDE = 96  # pixels of the pictures whose features are compared
 LEVELS = {"2": 16, "3": 32}  # of the features, and their strides
 MARGIN = 1.1
-WEIGHT, USUAL = 20.0, 0.56  # of an object's similarity, and the one that says nothing: docs/decisions/0015
 
 
 @dataclass(frozen=True)
 class NovelOptions:
     """How `NovelDetector` looks for objects that no detector was trained for."""
 
-    scales: tuple[float, ...] = (2 / 3, 1.0, 4 / 3)  # of the detector's ``use_size``, one look at the picture each
-    proposals: int = 80  # of a look at most
+    scales: tuple[float, ...] = (2 / 3, 1.0, 4 / 3)  # of the detector's ``use_size``, one run of the detector each
+    proposals: int = 80  # of a run at most
     same: float = 0.7  # intersection over union of boxes from which two scales propose the same
     screened: int = 40  # proposals that are compared with templates
     min_proposal_score: float = 0.1  # their least score
@@ -95,20 +94,20 @@ class AppearanceSimilarity:
     def of(
         self, view: View, model: ObjectModel, proposals: Sequence[Detection], appearance: _Appearance
     ) -> list[float]:
-        """Of each proposal, in [0, 1], in two rounds: what neither its features nor its chroma speaks for gets no
-        template search, and 0."""
+        """Of each proposal, in [0, 1], in two rounds: the template search is for the best by features and chroma; the
+        others get 0."""
         search, known = self._of(model)
         options = self.options
-        alike = np.maximum(0.0, (appearance.features @ known.features.T).max(axis=1) / len(LEVELS)).astype(np.float64)
+        cosine = np.maximum(0.0, (appearance.features @ known.features.T).max(axis=1) / len(LEVELS)).astype(np.float64)
         apart = np.linalg.norm(known.chroma[None] - appearance.chroma[:, None], axis=2).min(axis=1)
         own = np.array([proposal.score for proposal in proposals])
-        faded = np.exp(-apart / options.chroma) * own**options.objectness
-        screen = alike * faded
+        weight = np.exp(-apart / options.chroma) * own**options.objectness
+        screen = cosine * weight
         scores = np.zeros(len(proposals))
         for k in np.argsort(-screen, kind="stable")[: options.screened]:
             first = search.search(view, proposals[k], 1)
             shape = max(0.0, first[0].score) / (1 + search.options.colour) if first else 0.0
-            scores[k] = min(1.0, (shape + options.features * alike[k]) / (1 + options.features)) * faded[k]
+            scores[k] = min(1.0, (shape + options.features * cosine[k]) / (1 + options.features)) * weight[k]
         return [float(score) for score in scores]
 
     def _of(self, model: ObjectModel) -> tuple[TemplateSearch, _Appearance]:
@@ -121,6 +120,7 @@ class AppearanceSimilarity:
         return self._known[model]
 
     def appearance(self, view: View, proposals: Sequence[Detection]) -> _Appearance:
+        """The features and colours of N proposals' crops, to be compared with each model's views."""
         crops = [self._crop(view, proposal) for proposal in proposals]
         return _Appearance(self._features(crops), _chroma(crops))
 
@@ -167,8 +167,7 @@ class NovelDetector:
         self._textured: dict[ObjectModel, FeatureSearch] = {}
 
     def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
-        """The instances of the models, those found by local features first; with no models, whatever looks like an
-        object."""
+        """The instances of the models, those found by local features first; with no models, objects of any kind."""
         proposals = self.propose(view)
         if not models:
             return proposals
@@ -220,11 +219,15 @@ class NovelDetector:
     ) -> list[Detection]:
         scores = self.similarity.of(view, model, proposals, appearance)
         kept: list[Detection] = []
+        masks: list[NDArray[np.bool_]] = []
         for k in np.argsort(np.negative(scores), kind="stable"):
             proposal, score = proposals[int(k)], scores[int(k)]
             if score < self.options.min_score or len(kept) == self.options.max_detections:
                 break
-            if all(_overlap(proposal, other) < self.options.overlap for other in kept):
+            mask = proposal.mask
+            assert mask is not None
+            if all(mask_iou(mask, other) < self.options.overlap for other in masks):
+                masks.append(mask)
                 kept.append(Detection(proposal.box, proposal.mask, score, model.name, Source.NOVEL))
         return kept
 
@@ -250,8 +253,8 @@ class SimilarityDetector:
             if not mine or (model.colors is None and model.texture is None):
                 continue
             proposals = [found[k] for k in mine]
-            alike = self.similarity.of(view, model, proposals, self.similarity.appearance(view, proposals))
-            for k, similarity in zip(mine, alike, strict=True):
+            similarities = self.similarity.of(view, model, proposals, self.similarity.appearance(view, proposals))
+            for k, similarity in zip(mine, similarities, strict=True):
                 found[k] = replace(found[k], score=with_similarity(found[k].score, similarity))
         left: dict[str | None, int] = {}
         kept = []
@@ -260,16 +263,6 @@ class SimilarityDetector:
             if each.score >= self.min_score and left[each.label] >= 0:
                 kept.append(each)
         return kept
-
-
-def with_similarity(chance: float, similarity: float) -> float:
-    """A chance that also says how much a thing looks like the mesh: docs/decisions/0015."""
-    return shifted(chance, WEIGHT * (similarity - USUAL))
-
-
-def shifted(chance: float, shift: float) -> float:
-    """A chance whose log odds are shifted; 0 and 1 stay."""
-    return chance if not 0 < chance < 1 else 1 / (1 + (1 / chance - 1) * math.exp(-shift))
 
 
 def _chroma(pictures: Sequence[View]) -> FArray:
@@ -290,13 +283,7 @@ def clipped(box: Box, size: tuple[int, int]) -> Box:
 
 def _same_instance(a: Detection, b: Detection, overlap: float) -> bool:
     """Whether two detections of one mesh have boxes that lie on each other."""
-    return a.label == b.label and box_overlap(a.box, b.box) >= overlap
-
-
-def _overlap(a: Detection, b: Detection) -> float:
-    """Intersection over union of two masks."""
-    assert a.mask is not None and b.mask is not None
-    return float((a.mask & b.mask).sum() / max(1, (a.mask | b.mask).sum()))
+    return a.label == b.label and bool(box_iou(a.box, b.box) >= overlap)
 
 
 def make_detector(
@@ -308,9 +295,9 @@ def make_detector(
     doubtful: bool = False,
 ) -> tuple[Detector, tuple[str, ...]]:
     """A network's Detector and the names that its detections may have. name: "novel" (the default), "coco", or a
-    trained detector's file or folder. max_detections: of a mesh. doubtful: whether poses will judge the detections, so
-    that trained detectors' doubtful ones are wanted too, and no more than ``max_detections``. Raises WeightsError,
-    ConfigError.
+    trained detector's file or folder. max_detections: of a mesh. doubtful: whether the detections are verified by
+    poses, so that trained detectors' doubtful ones are wanted too, and no more than ``max_detections``. Raises
+    WeightsError, ConfigError.
     """
     file = SHIPPED if name is None or name == ANY else Path(name)
     trained = load_coco() if name == COCO else load_detector(file)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from posekit.camera import Box, Camera, mask_box
+from posekit.camera import Box, Camera, box_mask, mask_box
 from posekit.errors import PromptError
 from posekit.mesh.model import ObjectModel
 from posekit.results import Detection, Source
@@ -22,15 +22,16 @@ MASK_SOURCES = ("none", "grabcut", "filled")
 
 # Chosen on real crops: docs/decisions/0004-mask-from-a-box.md
 _SIDE = 176  # longer side of the picture that GrabCut works on, pixels
-_MARGIN = 0.12  # ground round the box that it sees, of the box's longer side
-_SURE, _LIKELY = 0.45, 1.15  # ellipses, of the box's own: inside the first is object, outside the second likely ground
+_MARGIN = 0.12  # background round the box that it sees, of the box's longer side
+# ellipses, of the box's own: inside the first is object, outside the second likely background
+_SURE, _LIKELY = 0.45, 1.15
 _ROUNDS = 3
 _LEAST_COVER = 0.75  # of the box's width and height: a mask that reaches less far has lost a part of the object
 _LEAST_AREA, _MOST_AREA = 0.2, 0.97  # of the box
 
 
 class Detector(Protocol):
-    """Whatever finds objects in a photograph."""
+    """A detector: finds objects in a photograph."""
 
     def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
         """The instances of the models in a view; none is an empty list."""
@@ -41,7 +42,7 @@ class Detector(Protocol):
 class BoxPrompt:
     """A box round the object, edges (x0, y0, x1, y1) in pixels.
 
-    mask_from: "none" (first poses need no mask), "grabcut" or "filled" (the box itself). Where GrabCut's answer cannot
+    mask_from: "none" (first poses need no mask), "grabcut" or "filled" (the box itself). Where GrabCut's result cannot
     be the object's silhouette, the filled box is taken, and the detection's ``source`` says "box+filled" instead of
     "box+grabcut".
     """
@@ -60,7 +61,7 @@ class BoxPrompt:
             return [Detection(box=box, label=model.name) for model in models]
         mask = grabcut_mask(view.image, box) if self.mask_from == "grabcut" else None
         source = Source.FILLED if mask is None else Source.GRABCUT
-        mask = filled_mask(box, view.camera) if mask is None else mask
+        mask = box_mask(box, view.camera.size) if mask is None else mask
         return [Detection(box=box, mask=mask, label=model.name, source=source) for model in models]
 
 
@@ -96,16 +97,8 @@ def clip_box(box: Box, camera: Camera) -> Box:
     return clipped
 
 
-def filled_mask(box: Box, camera: Camera) -> Mask:
-    """All pixels whose greater part lies in the box, at least one, (H, W)."""
-    mask = np.zeros((camera.height, camera.width), dtype=np.bool_)
-    x0, y0 = (min(round(low), size - 1) for low, size in zip(box[:2], camera.size, strict=True))
-    mask[y0 : max(round(box[3]), y0 + 1), x0 : max(round(box[2]), x0 + 1)] = True
-    return mask
-
-
 def grabcut_mask(image: NDArray[np.uint8], box: Box) -> Mask | None:
-    """The object in a box, separated from the ground by colour (GrabCut: Rother et al., 2004).
+    """The object in a box, separated from the background by colour (GrabCut: Rother et al., 2004).
 
     image: uint8 RGB (H, W, 3). box: edges, inside the picture. The same picture and box give the same mask.
     Returns a bool (H, W); None where what comes out is not a silhouette that fills the box as an object would.
@@ -119,7 +112,7 @@ def grabcut_mask(image: NDArray[np.uint8], box: Box) -> Mask | None:
     inner = _inner(box, window, size)
     labels = _first_labels(inner, size)
     if not ((labels == cv2.GC_BGD) | (labels == cv2.GC_PR_BGD)).any():
-        return None  # no ground to learn from
+        return None  # no background to learn from
     cv2.setRNGSeed(0)
     models = np.zeros((2, 1, 65))
     cv2.grabCut(small[..., ::-1].copy(), labels, None, models[0], models[1], _ROUNDS, cv2.GC_INIT_WITH_MASK)
@@ -148,7 +141,7 @@ def _inner(box: Box, window: tuple[int, int, int, int], size: tuple[int, int]) -
 
 
 def _first_labels(inner: tuple[int, int, int, int], size: tuple[int, int]) -> NDArray[np.uint8]:
-    """Ground outside the box, object in its middle, and guesses between, (h, w)."""
+    """Background outside the box, object in its middle, and guesses between, (h, w)."""
     a, b, c, d = inner
     x, y = np.arange(size[0]), np.arange(size[1])[:, None]
     radius = np.hypot((x - 0.5 * (a + c - 1)) / (0.5 * (c - a)), (y - 0.5 * (b + d - 1)) / (0.5 * (d - b)))
@@ -161,7 +154,7 @@ def _first_labels(inner: tuple[int, int, int, int], size: tuple[int, int]) -> ND
 
 
 def largest_blob(mask: Mask) -> Mask:
-    """The largest connected part without specks, fringes and holes."""
+    """The largest connected part, after opening, with holes filled."""
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))
     smooth = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, kernel)
     outlines, _ = cv2.findContours(smooth, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)

@@ -15,11 +15,11 @@ from posekit.results import Detection
 Mask = NDArray[np.bool_]
 
 SIDE = 96  # longer side of the picture that GrabCut works on, pixels
-MARGIN = 0.35  # ground round the box that it sees, of the box's longer side
-DOUBT = 0.1  # how far on both sides of the mask's outline the true one may lie, of the box's longer side
+MARGIN = 0.35  # background round the box that it sees, of the box's longer side
+UNCERTAIN = 0.1  # how far on both sides of the mask's outline the true one may lie, of the box's longer side
 ROUNDS = 3
-LEAST_OVERLAP = 0.4  # with the network's mask; what agrees less with it is another thing
-LEAST = 20  # pixels of a mask that say anything
+LEAST_OVERLAP = 0.4  # with the network's mask; what overlaps less is another object
+LEAST = 20  # pixels of a mask, at least
 
 
 def sharpened(image: NDArray[np.uint8], detection: Detection) -> Detection:
@@ -46,7 +46,7 @@ def _sharp(image: NDArray[np.uint8], rough: Mask, box: Box) -> Mask | None:
     flags = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     small = cv2.resize(image[y0:y1, x0:x1], size, interpolation=flags)
     mask = cv2.resize(rough[y0:y1, x0:x1].astype(np.float32), size, interpolation=flags) > 0.5
-    labels = _labels(mask, max(1, round(DOUBT * longer * scale)))
+    labels = _labels(mask, max(1, round(UNCERTAIN * longer * scale)))
     if mask.sum() < LEAST or not (labels == cv2.GC_BGD).any() or not (labels == cv2.GC_FGD).any():
         return None
     cv2.setRNGSeed(0)
@@ -61,7 +61,7 @@ def _sharp(image: NDArray[np.uint8], rough: Mask, box: Box) -> Mask | None:
 
 
 def _labels(mask: Mask, reach: int) -> NDArray[np.uint8]:
-    """Sure within ``reach`` pixels of the outline neither of the object nor of the ground, (h, w)."""
+    """Sure within ``reach`` pixels of the outline neither of the object nor of the background, (h, w)."""
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     solid = mask.astype(np.uint8)
     inner = cv2.erode(solid, kernel, borderValue=0)

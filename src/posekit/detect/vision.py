@@ -61,7 +61,7 @@ def _with_own_operators() -> Any:
              torch.__version__)  # fmt: skip
     define_operators()
     module = importlib.import_module("torchvision")
-    for name in ("torchvision.extension", "torchvision.ops.roi_align"):  # its own question whether there are operators
+    for name in ("torchvision.extension", "torchvision.ops.roi_align"):  # where torchvision checks for its operators
         sys.modules[name]._has_ops = lambda: True  # type: ignore[attr-defined]
     return module
 

@@ -6,6 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,16 +15,24 @@ from posekit.camera import Box, mask_box
 from posekit.errors import ConfigError
 from posekit.estimate.refine import Refinement, RefineOptions, compare, predicted_angle, refine, update_pose
 from posekit.first_pose.features import FeatureSearch
-from posekit.first_pose.hypotheses import BoxSearch, EvidenceScorer, Hypothesis, agreement_of, perturbed_poses
-from posekit.first_pose.mvnet import FirstPoseSearch, mvnet_search
+from posekit.first_pose.hypotheses import (
+    BoxSearch,
+    EvidenceScorer,
+    FirstPoseSearch,
+    Hypothesis,
+    agreement_of,
+    perturbed_poses,
+)
 from posekit.geometry import Pose, rotation_angle
 from posekit.mesh.model import ObjectModel
-from posekit.nets.precision import choose_device
-from posekit.nets.predictor import NetworkPredictor
-from posekit.nets.weights import Networks, load_networks
+from posekit.nets.predictor import Predictor
+from posekit.nets.runtime import Runtime
 from posekit.render import Renderer
 from posekit.results import Branch, Detection, Estimate
 from posekit.view import View
+
+if TYPE_CHECKING:
+    from posekit.nets.weights import Networks
 
 INITS = ("templates", "mvnet")
 AUTO = "auto"  # correspondences where the network gives them, else the regressed delta
@@ -70,8 +79,9 @@ class EstimateOptions:
 class PoseEstimator:
     """Estimates the pose of one object in photographs.
 
-    networks: where several estimators share them, in place of those that preset and weights name; see `Estimators`.
-    device: of the networks: "auto" (a GPU where there is one), "cpu" or "cuda".
+    networks: those of a training, or what several estimators share (see `Estimators`), in place of those that preset
+    and weights name. device: of the networks: "auto" (a GPU where there is one), "cpu" or "cuda". runtime: what runs
+    them: "openvino", "torch" or "auto", see `Runtime`.
     Not thread-safe: one estimator per thread. Raises WeightsError where the preset has no weights, ConfigError where
     there is no such device.
     """
@@ -83,22 +93,33 @@ class PoseEstimator:
         preset: str = "lite",
         weights: Path | None = None,
         options: EstimateOptions = EstimateOptions(),
-        networks: Networks | None = None,
+        networks: Networks | Runtime | None = None,
         device: str = "auto",
+        runtime: str = "auto",
     ) -> None:
         self.model, self.options = model, options
-        self.networks = load_networks(preset, weights).moved(choose_device(device)) if networks is None else networks
-        self.predictor = NetworkPredictor(self.networks)
+        if not isinstance(networks, Runtime):
+            networks = Runtime(preset, weights, device=device, runtime=runtime, networks=networks)
+        self.runtime = networks
+        self.predictor: Predictor = networks.predictor
         self.refine_options = options.refine_options(self.predictor.dense)
         self.renderer = Renderer()
         self._search: BoxSearch | FirstPoseSearch | None = None
         self._features = FeatureSearch(model, self.renderer)
         if options.init == "mvnet":
+            from posekit.first_pose.mvnet import mvnet_search
+
             self._search = mvnet_search(model, self.networks, self.renderer)
 
     @property
     def weights_hash(self) -> str:
-        return self.networks.digest
+        """16 hex digits of the weights' SHA-256."""
+        return self.runtime.digest
+
+    @property
+    def networks(self) -> Networks:
+        """PyTorch's networks; they are loaded where they were not needed before."""
+        return self.runtime.networks
 
     def estimate(self, view: View, detections: Sequence[Detection], min_score: float = 0.0) -> list[Estimate]:
         """One estimate for each detection that gives a silhouette to start from, in their order. least: the score that
@@ -279,13 +300,14 @@ class Estimators:
         weights: Path | None = None,
         options: EstimateOptions = EstimateOptions(),
         device: str = "auto",
+        runtime: str = "auto",
     ) -> None:
-        self.networks, self.options = load_networks(preset, weights).moved(choose_device(device)), options
+        self.runtime, self.options = Runtime(preset, weights, device=device, runtime=runtime), options
         self._made: dict[ObjectModel, PoseEstimator] = {}
 
     def __call__(self, model: ObjectModel) -> PoseEstimator:
         if model not in self._made:
-            self._made[model] = PoseEstimator(model, options=self.options, networks=self.networks)
+            self._made[model] = PoseEstimator(model, options=self.options, networks=self.runtime)
         return self._made[model]
 
 

@@ -1,4 +1,4 @@
-"""From detections that may be wrong to objects' instances: estimate, keep what the render bears out.
+"""From detections that may be wrong to objects' instances: estimate, and keep what the rendering confirms.
 
 The one way from a picture, meshes and detections to poses, for ``posekit estimate``, ``eval``, ``detect --verify`` and
 the tracker's search.
@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from posekit.camera import box_overlap
-from posekit.detect.novel import USUAL, WEIGHT, shifted
+from posekit.camera import box_iou
+from posekit.detect.similarity import USUAL, WEIGHT, shifted
 from posekit.errors import ConfigError
 from posekit.mesh.model import ObjectModel
 from posekit.results import Detection, Estimate, Source
@@ -21,7 +21,8 @@ from posekit.view import View
 class Estimator(Protocol):
     """What a `PoseEstimator` does for the search."""
 
-    def estimate(self, view: View, detections: Sequence[Detection], min_score: float = 0.0) -> list[Estimate]: ...
+    def estimate(self, view: View, detections: Sequence[Detection], min_score: float = 0.0) -> list[Estimate]:
+        """Estimates of its model at the detections, by falling score, those of at least ``min_score``."""
 
 
 EstimatorOf = Callable[[ObjectModel], Estimator]
@@ -41,8 +42,8 @@ class SearchOptions:
 
     @classmethod
     def usual(cls, detections: Sequence[Detection]) -> SearchOptions:
-        """By who says where the objects are. What a person says is taken as it is; what another program says gives all
-        instances that do not overlap; a detector's answers must be borne out by the render."""
+        """By the source of the detections. A person's are taken as they are; another program's give all instances that
+        do not overlap; a detector's detections must be confirmed by the rendering."""
         sources = [detection.source for detection in detections]
         if sources and all(source.given for source in sources):
             return cls(0, 0.0, 1.0 if all(source.by_hand for source in sources) else 0.5)
@@ -51,7 +52,7 @@ class SearchOptions:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What a picture shows of one mesh. detections: that were looked at. estimates: what they led to, in their order.
+    """What a picture shows of one mesh. detections: that were estimated. estimates: what they led to, in their order.
     instances: those of the estimates that are kept, best first."""
 
     model: ObjectModel
@@ -101,12 +102,12 @@ def instances_of(estimates: Sequence[Estimate], options: SearchOptions) -> list[
     """Those of an object's estimates that are instances of it, best first."""
     kept: list[Estimate] = []
     for each in sorted(estimates, key=lambda e: -e.score):
-        if each.score >= options.min_score and all(box_overlap(each.box, k.box) < options.overlap for k in kept):
+        if each.score >= options.min_score and all(box_iou(each.box, k.box) < options.overlap for k in kept):
             kept.append(each)
     return kept[: options.instances] if options.instances else kept
 
 
-def judged(found: Found) -> list[Detection]:
+def scored_by_poses(found: Found) -> list[Detection]:
     """A model's detections with the scores of the estimates that they led to (0 where to none), best first."""
     scores = {id(each.detection): each.score for each in found.estimates}
     scored = [replace(each, score=scores.get(id(each), 0.0)) for each in found.detections]

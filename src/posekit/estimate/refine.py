@@ -30,10 +30,11 @@ from posekit.zoom import zoom_to_pose
 
 UPDATES = ("regression", "correspondence")
 STOPS = ("angle", "fixed")
-RESTING = float(np.deg2rad(0.25))  # of turns, and as a share of the distance: a pose that moves less is at rest
+STILL = float(np.deg2rad(0.25))  # of turns, and as a share of the distance: a pose that moves less is converged
 NEAR = float(np.deg2rad(12.0))  # corrections below which the outline is looked for: further off it is out of reach
 LEAST_SCALE, KNEE = 0.5, 2.5  # pixels, no correspondence is more exact; standard deviations
-CORRELATED = 25.0  # so many correspondences err alike: they count as one against the outline's lines
+# number of correspondences whose errors are correlated: they count as one against the outline's lines
+CORRELATED = 25.0
 
 
 @dataclass(frozen=True)
@@ -182,8 +183,8 @@ def with_colour_edge(
     do not show one.
 
     target: by the correspondences alone. points: (N, 3) metres in ``ctr``, of ``found``. The colours of the object and
-    of what is round it are learned from the silhouette that the network sees in the crop, not from the pose's; where it
-    sees something in front, the outline is not asked. center: (3,), the model's.
+    of what is round it are learned from the silhouette that the network sees in the crop, not from the pose's; where
+    it sees something in front, the outline is not used. center: (3,), the model's.
     """
     assert prediction.silhouettes is not None
     visible, whole = (cv2.resize(s, rendered.camera.size, interpolation=cv2.INTER_LINEAR) > 0.5
@@ -203,7 +204,7 @@ def with_colour_edge(
 def predicted_angle(T_cam_obj: Pose, prediction: PairPrediction, updated: Pose | None, update: str) -> float:
     """The rotation error (radians) that the network sees in a pose.
 
-    The angle head's answer; where correspondences move the pose, at least the turn that they ask for: a small angle
+    The angle head's output; where correspondences move the pose, at least the turn that they ask for: a small angle
     beside a large correction is no convergence.
     """
     if update == "regression" or updated is None:
@@ -212,7 +213,7 @@ def predicted_angle(T_cam_obj: Pose, prediction: PairPrediction, updated: Pose |
 
 
 class _Loop:
-    """One hypothesis on its way."""
+    """One hypothesis during refinement."""
 
     def __init__(self, start: Pose) -> None:
         self.pose = start
@@ -229,15 +230,15 @@ class _Loop:
         if options.stop == "angle" and angle < options.stop_angle:
             self.done = self.converged = True
             return
-        if options.stop == "angle" and (self._rests(updated) or len(self.steps) - self._lowest() > options.patience):
+        if options.stop == "angle" and (self._is_still(updated) or len(self.steps) - self._lowest() > options.patience):
             self.done = True
             return
         self.pose = updated
 
-    def _rests(self, updated: Pose) -> bool:
-        """Whether an update moves the pose by less than it can be known: all further ones would do the same."""
+    def _is_still(self, updated: Pose) -> bool:
+        """Whether an update moves the pose by less than its accuracy: all further ones would, too."""
         turn, shift = pose_change(self.pose, updated)
-        return turn < RESTING and shift < RESTING * float(np.linalg.norm(updated.t))
+        return turn < STILL and shift < STILL * float(np.linalg.norm(updated.t))
 
     def _lowest(self) -> int:
         """The step with the lowest predicted angle."""

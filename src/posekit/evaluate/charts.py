@@ -24,9 +24,11 @@ class Axes:
     x_from: float = 0.0
 
     def x(self, value: float) -> float:
+        """Where a value lies, SVG units from the left."""
         return _LEFT + (value - self.x_from) / (self.x_to - self.x_from) * (WIDTH - _LEFT - _RIGHT)
 
     def y(self, value: float) -> float:
+        """Where a value lies, SVG units from the top."""
         return HEIGHT - _BOTTOM - value / self.y_to * (HEIGHT - _TOP - _BOTTOM)
 
 

@@ -30,6 +30,7 @@ class Difference:
 
     @property
     def difference(self) -> float:
+        """B - A, percent."""
         return self.b - self.a
 
     @property

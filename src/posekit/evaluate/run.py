@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from posekit import metrics
 from posekit._version import __version__
 from posekit.datasets.registry import Dataset, DatasetInfo, open_dataset
 from posekit.datasets.results_csv import ResultRow, csv_name, read_results, results_csv
+from posekit.detect.coco import Overlaps, average_precision_of_overlaps
 from posekit.errors import ConfigError, OutputError
 from posekit.evaluate import table
 from posekit.evaluate.options import EvalOptions
@@ -28,7 +28,7 @@ from posekit.evaluate.vsd import VsdMeter
 from posekit.evaluate.workers import run_pictures
 from posekit.geometry import Pose
 from posekit.io.files import check_writable, write_text_atomic
-from posekit.nets.weights import load_networks
+from posekit.nets.config import WeightsFile
 
 log = logging.getLogger("posekit")
 
@@ -55,7 +55,7 @@ def evaluate(
 ) -> Outcome:
     """Run a stage, score it, and write results.json, the BOP CSV and report.html into ``out``.
 
-    A run that was interrupted is gone on with. csv: the results file of the ``score`` stage. with_vsd: where the
+    A run that was interrupted is continued. csv: the results file of the ``score`` stage. with_vsd: where the
     data set has depth. progress: called with the numbers of finished and of all pictures.
     Raises ConfigError, InputError, OutputError and what the stages raise.
     """
@@ -67,7 +67,7 @@ def evaluate(
     if not wanted:
         raise ConfigError(f"no picture of {info.title} is left: check --images and the test's targets.")
     _check_objects(data, options)
-    weights = None if options.stage == "score" else load_networks(options.preset, options.weights)
+    weights = None if options.stage == "score" else WeightsFile.read(options.preset, options.weights)
     about = weights.about if weights is not None else {}
     source = table.Provenance(
         command,
@@ -222,11 +222,13 @@ def detection_ap(records: Sequence[Mapping[str, Record]]) -> dict[str, float | N
             if any(e[f"{kind}_iou"] is None for e in here):
                 values = []
                 break
-            truths = [metrics.Regions(np.zeros(0), np.array(e["ignored"], dtype=np.bool_)) for e in here]
-            found = [metrics.Regions(np.array(e["scores"]), np.zeros(0, dtype=np.bool_)) for e in here]
             shape = [(len(e["scores"]), len(e["ignored"])) for e in here]
-            iou = [np.array(e[f"{kind}_iou"], dtype=np.float64).reshape(s) for e, s in zip(here, shape, strict=True)]
-            values.append((metrics.coco_ap(truths, found, iou), metrics.coco_ap(truths, found, iou, (0.5,))))
+            pictures = [
+                Overlaps(np.array(e["scores"], dtype=np.float64), np.array(e["ignored"], dtype=np.bool_),
+                         np.array(e[f"{kind}_iou"], dtype=np.float64).reshape(s))
+                for e, s in zip(here, shape, strict=True)
+            ]  # fmt: skip
+            values.append(average_precision_of_overlaps(pictures))
         known = [v for v in values if np.isfinite(v).all()]
         result[f"coco_{kind}_ap"], result[f"coco_{kind}_ap50"] = (
             (100 * np.mean(known, axis=0)).tolist() if known else (None, None)

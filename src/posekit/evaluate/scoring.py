@@ -1,4 +1,4 @@
-"""Estimates against truths, vectorised over each object: errors and what they are worth in every measure."""
+"""Estimates against truths, vectorised over each object: errors, and their value in every measure."""
 
 from __future__ import annotations
 
@@ -239,7 +239,7 @@ def _symmetric_error(est: Array, gt: Array, symmetries: Sequence[Pose]) -> tuple
 
 
 def _hits(errors: Mapping[str, Array], diameter: float) -> dict[str, Array]:
-    """What each case is worth in the measures that follow from its errors."""
+    """Each case's value in the measures that follow from its errors."""
     hits = {}
     for n in LEVELS:
         for suffix in ("", "_sym"):
@@ -322,14 +322,14 @@ def _precision(group: _Group, pair_errors: Array, thresholds: Array) -> float | 
     scores = np.array(group.scores(group.order.tolist()))
     values = []
     for threshold in thresholds:
-        right, used = _judged(group, pair_errors, float(threshold))
+        right, used = _right_and_used(group, pair_errors, float(threshold))
         values.append(
             metrics.average_precision(right[group.order][used[group.order]], scores[used[group.order]], total)
         )
     return float(np.mean(values))
 
 
-def _judged(group: _Group, pair_errors: Array, threshold: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _right_and_used(group: _Group, pair_errors: Array, threshold: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Which guesses are right, and which count at all: not those beyond AP_MOST in a picture, nor those that hit an
     instance which is not asked for."""
     right, used = np.zeros(len(group.guesses), dtype=np.bool_), np.zeros(len(group.guesses), dtype=np.bool_)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from posekit.camera import Box, mask_box
+from posekit.camera import Box, box_iou, mask_box, mask_iou
 from posekit.datasets.registry import open_dataset
 from posekit.datasets.results_csv import FoundRegion, read_detections
 from posekit.detect import BoxPrompt, Detector
@@ -26,13 +26,12 @@ from posekit.detect.prompts import clip_box
 from posekit.detect.segmentation import encode, xywh
 from posekit.errors import PromptError
 from posekit.estimate.estimator import Estimators, PoseEstimator
-from posekit.estimate.instances import SearchOptions, find_instances, judged
+from posekit.estimate.instances import SearchOptions, find_instances, scored_by_poses
 from posekit.evaluate.options import DETECTOR, GIVEN, EvalOptions
 from posekit.evaluate.tracking import Sequences
 from posekit.evaluate.truths import Truth, TruthReader, pictures, selected
 from posekit.geometry import Pose
 from posekit.mesh.model import ObjectModel
-from posekit.metrics import box_iou
 from posekit.results import Detection, Estimate, Source
 from posekit.view import View
 
@@ -123,7 +122,7 @@ class ImageStage:
         return entries
 
     def _regions(self, view: View, scene: int, image: int) -> list[FoundRegion]:
-        """What the file has for a picture; what does not fit the picture is skipped and told."""
+        """What the file has for a picture; what does not fit the picture is skipped and logged."""
         found = []
         for region in self._files.get((scene, image), ()):
             try:
@@ -137,7 +136,7 @@ class ImageStage:
 
     def _detected(self, view: View, scene: int, image: int) -> tuple[list[Record], list[FoundRegion]]:
         """Estimates from what the detector finds of the data set's objects, and the detections. As `posekit estimate`
-        does, only what the render bears out is kept, but any number of instances; detections are scored by the poses
+        does, only what the rendering confirms is kept, but any number of instances; detections are scored by the poses
         that they lead to."""
         numbers = self.options.objects or tuple(self.data.model_ids())
         models = {obj_id: self.data.model(obj_id) for obj_id in numbers}
@@ -149,7 +148,7 @@ class ImageStage:
         entries, regions = [], []
         results = find_instances(self._estimators_of, view, list(models.values()), found, SearchOptions(instances=0))
         for obj_id, each in zip(models, results, strict=True):
-            regions += [_region(d, scene, image, obj_id, seconds) for d in judged(each)]
+            regions += [_region(d, scene, image, obj_id, seconds) for d in scored_by_poses(each)]
             entries += [_entry(e, obj_id, None) | {"detection_score": _detection_score(e)} for e in each.instances]
         return entries, regions
 
@@ -243,27 +242,27 @@ def overlaps(found: Sequence[FoundRegion], truths: Sequence[Truth]) -> dict[str,
     for obj_id in sorted({r.obj_id for r in found} | {t.instance.obj_id for t in truths}):
         regions = [r for r in found if r.obj_id == obj_id]
         here = [t for t in truths if t.instance.obj_id == obj_id]
-        shape = (len(regions), len(here))
         boxes = [t.box_all or (0.0, 0.0, 0.0, 0.0) for t in here]
         masked = bool(regions) and all(r.rle is not None for r in regions)
         result[str(obj_id)] = {
             "scores": [r.score for r in regions],
             "ignored": [t.visible < IGNORED_BELOW for t in here],
-            "box_iou": box_iou([r.box for r in regions], boxes).reshape(shape).tolist(),
-            "mask_iou": mask_iou(regions, here).tolist() if masked or not regions else None,
+            "box_iou": box_iou(_rows(r.box for r in regions)[:, None], _rows(boxes)[None]).tolist(),
+            "mask_iou": _mask_overlaps(regions, here).tolist() if masked or not regions else None,
         }
     return result
 
 
-def mask_iou(regions: Sequence[FoundRegion], truths: Sequence[Truth]) -> NDArray[np.float64]:
+def _rows(boxes: Iterable[Box]) -> NDArray[np.float64]:
+    """(N, 4), where there are none too."""
+    return np.array(list(boxes), dtype=np.float64).reshape(-1, 4)
+
+
+def _mask_overlaps(regions: Sequence[FoundRegion], truths: Sequence[Truth]) -> NDArray[np.float64]:
     """(D, G)."""
     found, true = [r.mask() for r in regions], [t.read_mask() for t in truths]
-    iou = np.zeros((len(found), len(true)))
-    for d, a in enumerate(found):
-        for g, b in enumerate(true):
-            either = (a | b).sum() if a is not None else 0
-            iou[d, g] = (a & b).sum() / either if a is not None and either else 0.0
-    return iou
+    iou = [[0.0 if a is None else mask_iou(a, b) for b in true] for a in found]
+    return np.array(iou, dtype=np.float64).reshape(len(found), len(true))
 
 
 def run_once(stage: ImageStage, scene: int, image: int) -> Record:

@@ -1,4 +1,4 @@
-"""An evaluation's folder: one file for each finished picture, so that a killed run goes on where it was.
+"""An evaluation's folder: one file for each finished picture, so that a killed run can be continued.
 
 ``run.json`` says what decides the results; a folder of another run is refused. ``pictures/SCENE_IMAGE.json`` are the
 records, each written whole or not at all.
@@ -21,7 +21,7 @@ Picture = tuple[int, int]
 class RunFolder:
     """Records on disk. identity: what decides the results, plain values.
 
-    Raises OutputError where the folder holds other files or another run; with ``force`` a run in it is thrown away.
+    Raises OutputError where the folder holds other files or another run; with ``force`` a run in it is deleted.
     """
 
     def __init__(self, path: Path, identity: Mapping[str, Any], force: bool = False) -> None:
@@ -55,9 +55,11 @@ class RunFolder:
             (self.path / name).unlink(missing_ok=True)
 
     def has(self, picture: Picture) -> bool:
+        """Whether there is a record of the picture."""
         return self._file(picture).is_file()
 
     def read(self, picture: Picture) -> dict[str, Any]:
+        """A picture's record. Raises OutputError where it is missing or damaged."""
         path = self._file(picture)
         try:
             record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
@@ -66,6 +68,7 @@ class RunFolder:
         return record
 
     def write(self, picture: Picture, record: Mapping[str, Any]) -> None:
+        """Write a picture's record, whole or not at all."""
         write_text_atomic(self._file(picture), json.dumps(record))
 
     def _file(self, picture: Picture) -> Path:

@@ -121,7 +121,8 @@ def _seconds(scored: Scored) -> dict[str, float | None]:
 
 
 def instances(scored: Scored) -> list[dict[str, Any]]:
-    """One entry for each case: what it is, what was estimated, its errors and what it is worth, all in percent."""
+    """One entry for each case: what it is, what was estimated, its errors and its value in every measure, all in
+    percent."""
     entries = []
     for k, (case, guess) in enumerate(zip(scored.cases, scored.guesses, strict=True)):
         entry: dict[str, Any] = {

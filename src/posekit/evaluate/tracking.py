@@ -20,6 +20,7 @@ class TrueMask:
     truth: Truth | None = None
 
     def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
+        """The annotated mask as the first model's detection, score 1; nothing where it is hidden or of another size."""
         if self.truth is None or self.truth.visible < 0.1:
             return []
         mask = self.truth.read_mask()
@@ -29,7 +30,7 @@ class TrueMask:
 
 
 class Sequences:
-    """One tracker for each object of the scene that is at work; frames come in order. A lost object's true mask stands
+    """One tracker for each object of the current scene; frames come in order. A lost object's true mask stands
     for the detector. Objects that a scene has several times are followed once, the first of them."""
 
     def __init__(self, estimator: Callable[[int], PoseEstimator], runtime: str) -> None:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, cast
 from posekit.errors import PosekitError
 from posekit.evaluate.options import EvalOptions
 from posekit.evaluate.stages import ImageStage, Record, Regions, run_once
+from posekit.nets import precision
 
 if TYPE_CHECKING:
     from multiprocessing.context import SpawnProcess
@@ -69,7 +70,7 @@ class _Pool:
         picture = next(left, None)
         if picture is not None:
             at[pipe] = picture
-            with suppress(BrokenPipeError):  # a dead worker is reported where its answer is awaited
+            with suppress(BrokenPipeError):  # a dead worker is reported where its result is awaited
                 pipe.send(picture)
 
     def _answer(self, pipe: Connection, picture: Picture) -> Record:
@@ -94,14 +95,15 @@ class _Pool:
 
 @contextmanager
 def _threads(count: int) -> Iterator[None]:
-    """Torch with so many threads, in this process; afterwards with as many as before."""
+    """The networks with so many threads, in this process; afterwards with as many as before."""
     import torch
 
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
+    before, told = torch.get_num_threads(), precision.threads()
+    precision.use_threads(count)
     try:
         yield
     finally:
+        precision.use_threads(told)
         torch.set_num_threads(before)
 
 

@@ -19,7 +19,7 @@ FArray = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Image = NDArray[np.uint8]
 
-CLUSTERS = 24  # colours that are told apart
+CLUSTERS = 24  # of colours
 QUIET = 6.0  # grey values: a spread of colours below which they say little
 FAINT, CLEAR = 8.0, 2.0  # grey values added to a picture's mean gradient; multiples of the sum that count at most
 LEVELS = 32.0  # steps of a normalised colour, kept as an int8
@@ -173,7 +173,8 @@ class Silhouettes:
 
 
 def separation(inside: FArray, total: FArray) -> FArray:
-    """How much colours tell of being inside: mutual information over the entropy of being inside, (T,), in [0, 1].
+    """How much information colours give about being inside: mutual information over the entropy of being inside, (T,),
+    in [0, 1].
 
     inside: (T, K), pixels of each colour inside each silhouette. total: (K,), in the whole picture.
     """

@@ -2,17 +2,14 @@
 
 RootSIFT descriptors (Lowe, 2004; Arandjelovic and Zisserman, 2012) of views from all sides, each with its place on the
 mesh; a robust PnP (OpenCV's USAC with MAGSAC's score) of the matches gives poses without any training. What a match
-says beside its place, the keypoint's size and turn, decides whether it bears a pose out.
+says beside its place, the keypoint's size and turn, decides whether it is consistent with a pose.
 """
 
 from __future__ import annotations
 
-import hashlib
-import io
-import zipfile
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import cv2
@@ -21,9 +18,8 @@ from numpy.typing import NDArray
 
 from posekit.align.pnp import PnpConfig, solve_pnp
 from posekit.camera import Box, Camera
-from posekit.errors import OutputError
+from posekit.first_pose.mesh_cache import cache_file, keep_arrays, read_arrays
 from posekit.geometry import Pose, cube_views
-from posekit.io.files import user_cache, write_bytes_atomic
 from posekit.mesh.model import ObjectModel
 from posekit.render import Light, Renderer, centred_poses, view_rotations
 from posekit.view import View
@@ -33,7 +29,6 @@ FArray = NDArray[np.float32]
 
 
 VERSION = 1  # of what is kept on disk; a change of the views or of the extraction raises it
-KEPT = 100  # meshes whose features stay on disk
 SIDE = 256  # pixels of a rendered view
 FIELD = float(np.deg2rad(30.0))  # of a rendered view
 OF_VIEW, OF_PICTURE = 400, 8000  # keypoints at most, the strongest
@@ -42,7 +37,7 @@ PICTURE_SIDES = 1280, 1920  # pixels of a whole picture's longer side: small one
 BOX_SIDES = 384, 768  # likewise of a box
 MOST_ENLARGED = 2.0, 4.0  # of a picture, of a box
 BOX_MARGIN = 1.3
-ALIKE = 0.8  # cosine of two descriptors of one thing, where its place is known
+MIN_SIMILARITY = 0.8  # cosine of two descriptors of one place of the mesh
 
 
 @dataclass(frozen=True)
@@ -57,7 +52,7 @@ class FeatureOptions:
     error_px: float = 2.0
     size: float = 1.6  # factor between a keypoint's size and the one that the pose gives it
     turn: float = float(np.deg2rad(35.0))  # radians, likewise
-    min_matches: int = 8  # matches at different places that bear a pose out
+    min_matches: int = 8  # least consistent matches at different places
     share: float = 0.3  # of all matches with the mesh's picture area
     spread: float = 0.05  # of the projected mesh's area, within these matches
     instances: int = 5  # at most
@@ -92,18 +87,19 @@ class FeatureModel:
         if model.texture is None and model.colors is None:
             none = np.zeros((0, 3))
             return cls(np.zeros((0, 128), np.float32), none, none, none, True)
-        kept = cache_file(model)
-        with suppress(OSError, ValueError, KeyError, zipfile.BadZipFile):  # not there yet, or damaged: made anew
-            return _read(kept)
-        made = _extracted(model, renderer)
-        with suppress(OSError, OutputError):  # a cache that cannot be written costs time only
-            _keep(kept, made)
-        return _decoded(*made)
+        file = cache_file("features", model, VERSION)
+        kept = _read(file)
+        if kept is not None:
+            return kept
+        raw, points, tips, directions, plain = _extracted(model, renderer)
+        arrays: dict[str, NDArray[Any]] = {"raw": raw, "points": points, "tips": tips, "directions": directions}
+        keep_arrays(file, arrays | {"plain": np.asarray(plain)})
+        return _decoded(raw, points, tips, directions, plain)
 
 
 @dataclass(frozen=True, eq=False)
 class FeaturePose:
-    """An instance found. inliers: matches that bear it out, at different places. share: of the matches in its part of
+    """An instance found. inliers: consistent matches at different places. share: of the matches in its part of
     the picture. points: (N, 3), metres in ``obj``; pixels: (N, 2), pixel centres: these matches. box: edges, of the
     projected mesh."""
 
@@ -124,6 +120,7 @@ class FeatureSearch:
 
     @property
     def features(self) -> FeatureModel:
+        """The model's local features, computed at the first call and kept."""
         if self._features is None:
             self._features = FeatureModel.of(self.model, self.renderer)
         return self._features
@@ -137,15 +134,15 @@ class FeatureSearch:
         seen = keypoints_of(view, box)
         if len(seen.pixels) < self.options.min_matches:
             return []
-        alike = seen.descriptors @ known.descriptors.T
+        similarity = seen.descriptors @ known.descriptors.T
         found: list[FeaturePose] = []
         while len(found) < self.options.instances:
-            rows, columns = self._matches(alike)
+            rows, columns = self._matches(similarity)
             one = self._instance(view.camera, seen, rows, columns, self._error(view.camera, box))
             if one is None:
                 break
-            found.append(self._polished(view.camera, seen, alike, one, self._error(view.camera, box)))
-            alike[self._inside(view.camera, one.T_cam_obj, seen.pixels)] = -1.0
+            found.append(self._refined(view.camera, seen, similarity, one, self._error(view.camera, box)))
+            similarity[self._inside(view.camera, one.T_cam_obj, seen.pixels)] = -1.0
         return sorted(found, key=lambda f: -f.inliers)
 
     def _error(self, camera: Camera, box: Box | None) -> float:
@@ -155,18 +152,18 @@ class FeatureSearch:
             longer = 2.0 * max(box[2] - box[0], box[3] - box[1])
         return max(options.error_px, options.error * longer)
 
-    def _matches(self, alike: FArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def _matches(self, similarity: FArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Of the picture's and the mesh's features: each other's best, and clearly better than other places of the
-        mesh. alike: (P, N), cosines."""
-        best, back = alike.argmax(1), alike.argmax(0)
-        rows = np.flatnonzero((back[best] == np.arange(len(best))) & (alike.max(1) > 0))
+        mesh. similarity: (P, N), cosines."""
+        best, back = similarity.argmax(1), similarity.argmax(0)
+        rows = np.flatnonzero((back[best] == np.arange(len(best))) & (similarity.max(1) > 0))
         points = self.features.points.astype(np.float32)
         elsewhere = np.empty(len(rows), np.float32)
         for k, row in enumerate(rows):
-            other = alike[row].copy()
+            other = similarity[row].copy()
             other[((points - points[best[row]]) ** 2).sum(1) < (self.options.apart * self.model.diameter) ** 2] = -1.0
             elsewhere[k] = other.max()
-        near = np.maximum(0, 1 - alike[rows, best[rows]])
+        near = np.maximum(0, 1 - similarity[rows, best[rows]])
         rows = rows[near < self.options.ratio**2 * (1 - elsewhere)]
         return rows, best[rows]
 
@@ -182,19 +179,25 @@ class FeatureSearch:
         for _ in range(2):
             if pose is None:
                 return None
-            borne = self._borne_out(camera, seen, rows, columns, pose, error)
-            if borne.sum() < options.min_matches:
+            consistent = self._consistent(camera, seen, rows, columns, pose, error)
+            if consistent.sum() < options.min_matches:
                 return None
-            ones = np.ones(int(borne.sum()))
+            ones = np.ones(int(consistent.sum()))
             pose = solve_pnp(
-                points[borne], pixels[borne], ones, ones, camera, pose, PnpConfig(min_points=options.min_matches)
+                points[consistent],
+                pixels[consistent],
+                ones,
+                ones,
+                camera,
+                pose,
+                PnpConfig(min_points=options.min_matches),
             )
         if pose is None or pose.t[2] < 0.5 * self.model.diameter:
             return None
-        borne = self._borne_out(camera, seen, rows, columns, pose, error)
-        return self._judged(camera, pose, points, pixels, borne, error)
+        consistent = self._consistent(camera, seen, rows, columns, pose, error)
+        return self._accepted(camera, pose, points, pixels, consistent, error)
 
-    def _borne_out(
+    def _consistent(
         self,
         camera: Camera,
         seen: Keypoints,
@@ -214,21 +217,24 @@ class FeatureSearch:
         length, wanted = np.linalg.norm(tips, axis=1), np.linalg.norm(seen.tips[rows], axis=1)
         sized = np.abs(np.log((length + 1e-9) / wanted)) < np.log(self.options.size)
         turned = (tips * seen.tips[rows]).sum(1) > np.cos(self.options.turn) * length * wanted
-        eye = -T_cam_ctr.R.T @ T_cam_ctr.t
-        shown = known.directions[columns] @ (eye / np.linalg.norm(eye)) > 0.3
+        viewpoint = -T_cam_ctr.R.T @ T_cam_ctr.t
+        shown = known.directions[columns] @ (viewpoint / np.linalg.norm(viewpoint)) > 0.3
         return np.asarray(before & near & sized & turned & shown)
 
-    def _polished(self, camera: Camera, seen: Keypoints, alike: FArray, one: FeaturePose, error: float) -> FeaturePose:
-        """With all keypoints that the pose explains and that look alike, whether or not they look like others too."""
+    def _refined(
+        self, camera: Camera, seen: Keypoints, similarity: FArray, one: FeaturePose, error: float
+    ) -> FeaturePose:
+        """With all keypoints that the pose explains and whose descriptors are similar, whether or not others are
+        too."""
         T_cam_ctr = one.T_cam_obj @ self.model.T_obj_ctr
         inside = np.flatnonzero(self._inside(camera, one.T_cam_obj, seen.pixels))
-        pairs = np.argwhere(alike[inside] > ALIKE)
+        pairs = np.argwhere(similarity[inside] > MIN_SIMILARITY)
         if not len(pairs):
             return one
         rows, columns = inside[pairs[:, 0]], pairs[:, 1]
-        borne = self._borne_out(camera, seen, rows, columns, T_cam_ctr, error)
-        rows, columns = rows[borne], columns[borne]
-        order = np.argsort(-alike[rows, columns], kind="stable")  # each keypoint's best only
+        consistent = self._consistent(camera, seen, rows, columns, T_cam_ctr, error)
+        rows, columns = rows[consistent], columns[consistent]
+        order = np.argsort(-similarity[rows, columns], kind="stable")  # each keypoint's best only
         first = order[np.unique(rows[order], return_index=True)[1]]
         rows, columns = rows[first], columns[first]
         if len(rows) < one.inliers:
@@ -242,25 +248,25 @@ class FeatureSearch:
         box = camera.points_box(T_cam_obj.apply(self.model.hull_vertices))
         return replace(one, T_cam_obj=T_cam_obj, points=points + self.model.center, pixels=pixels, box=box)
 
-    def _judged(
-        self, camera: Camera, T_cam_ctr: Pose, points: Array, pixels: Array, borne: NDArray[np.bool_], error: float
+    def _accepted(
+        self, camera: Camera, T_cam_ctr: Pose, points: Array, pixels: Array, consistent: NDArray[np.bool_], error: float
     ) -> FeaturePose | None:
-        """As the result where enough matches, spread over the mesh, bear it out."""
+        """As the result where enough matches, spread over the mesh, are consistent with it."""
         T_cam_obj = T_cam_ctr @ self.model.T_ctr_obj
         hull = self._hull(camera, T_cam_obj)
-        if hull is None or not borne.any():
+        if hull is None or not consistent.any():
             return None
-        chosen = np.flatnonzero(borne)[_different(pixels[borne], error)]
-        rivals = _within(hull, pixels)
-        share = float(borne.sum() / max(1, (rivals | borne).sum()))
+        chosen = np.flatnonzero(consistent)[_different(pixels[consistent], error)]
+        inside = _within(hull, pixels)
+        share = float(consistent.sum() / max(1, (inside | consistent).sum()))
         area = float(cv2.contourArea(cv2.convexHull(pixels[chosen].astype(np.float32)))) if len(chosen) > 2 else 0.0
         spread = area / max(1.0, float(cv2.contourArea(hull)))
         options = self.options
         if len(chosen) < options.min_matches or share < options.share or spread < options.spread:
             return None
         outline = T_cam_obj.apply(self.model.hull_vertices)
-        places = points[borne] + self.model.center
-        return FeaturePose(T_cam_obj, len(chosen), share, places, pixels[borne], camera.points_box(outline))
+        places = points[consistent] + self.model.center
+        return FeaturePose(T_cam_obj, len(chosen), share, places, pixels[consistent], camera.points_box(outline))
 
     def _hull(self, camera: Camera, T_cam_obj: Pose) -> FArray | None:
         """The projected mesh's convex hull (N, 1, 2); None where it reaches behind the camera."""
@@ -285,7 +291,7 @@ def _robust_pose(points: Array, pixels: Array, camera: Camera, error: float, see
     params.loMethod, params.randomGeneratorState, params.isParallel = cv2.LOCAL_OPTIM_INNER_LO, seed, False
     try:
         fitted, _, turn, t, _ = cv2.solvePnPRansac(points, pixels, camera.K, None, params=params)
-    except cv2.error:  # its answer to degenerate matches
+    except cv2.error:  # raised for degenerate matches
         return None
     if not fitted or not np.isfinite(turn).all() or not np.isfinite(t).all():
         return None
@@ -392,40 +398,22 @@ def _of_view(view: View, T_view_ctr: Pose) -> tuple[NDArray[np.uint8], Array, Ar
     depth = view.depth[whole[:, 1], whole[:, 0]]
     T_ctr_view = T_view_ctr.inverse()
     points, ends = (T_ctr_view.apply(view.camera.backproject(p, depth)) for p in (at, at + tips))
-    eye = T_ctr_view.t / np.linalg.norm(T_ctr_view.t)
-    return raw, points, ends - points, np.broadcast_to(eye, points.shape)
+    viewpoint = T_ctr_view.t / np.linalg.norm(T_ctr_view.t)
+    return raw, points, ends - points, np.broadcast_to(viewpoint, points.shape)
 
 
 def _decoded(raw: NDArray[np.uint8], points: Array, tips: Array, directions: Array, plain: bool) -> FeatureModel:
     return FeatureModel(_root(raw), points, tips, directions, plain)
 
 
-def cache_file(model: ObjectModel) -> Path:
-    """Where a mesh's features are kept: named by its shape, its colours or texture, and this module's version."""
-    look = hashlib.sha256(model.digest.encode())
-    for array in (model.colors, model.uvs, model.texture):
-        if array is not None:
-            look.update(str(array.shape).encode() + np.ascontiguousarray(array).tobytes())
-    return user_cache("features") / f"{model.digest}-{look.hexdigest()[:16]}-{VERSION}.npz"
-
-
-def _keep(path: Path, made: _Made) -> None:
-    """Written whole or not at all; the oldest files make room."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    raw, points, tips, directions, plain = made
-    buffer = io.BytesIO()
-    np.savez(buffer, raw=raw, points=points, tips=tips, directions=directions, plain=plain)
-    write_bytes_atomic(path, buffer.getvalue())
-    files = sorted(path.parent.glob("*.npz"), key=lambda p: p.stat().st_mtime)
-    for old in files[:-KEPT]:
-        old.unlink(missing_ok=True)
-
-
-def _read(path: Path) -> FeatureModel:
-    """Raises OSError, ValueError, KeyError or BadZipFile where there is none that can be used."""
-    with np.load(path, allow_pickle=False) as kept:
-        made = _decoded(kept["raw"], kept["points"], kept["tips"], kept["directions"], bool(kept["plain"]))
+def _read(path: Path) -> FeatureModel | None:
+    """None where there is none that can be used."""
+    kept = read_arrays(path)
+    if kept is None or set(kept) != {"raw", "points", "tips", "directions", "plain"}:
+        return None
+    made = _decoded(kept["raw"], kept["points"], kept["tips"], kept["directions"], bool(kept["plain"]))
     n = len(made.points)
-    if made.descriptors.shape != (n, 128) or {made.points.shape, made.tips.shape, made.directions.shape} != {(n, 3)}:
-        raise ValueError(f"{path} holds other arrays than features")
-    return made
+    fits = made.descriptors.shape == (n, 128) and {made.points.shape, made.tips.shape, made.directions.shape} == {
+        (n, 3)
+    }
+    return made if fits else None

@@ -9,36 +9,33 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from posekit.camera import Box, Camera
-from posekit.errors import PromptError, WeightsError
+from posekit.errors import PromptError
 from posekit.first_pose.evidence import Palette, Picture, Silhouettes, Weights
+from posekit.first_pose.mesh_cache import cache_file, keep_arrays, read_arrays
 from posekit.geometry import (
     Pose,
-    cube_views,
     fibonacci_sphere,
-    quat_to_rotation,
     rotation_between,
     so3_exp,
     view_rotation,
 )
 from posekit.mesh.model import ObjectModel
-from posekit.nets.inputs import to_input
-from posekit.nets.pose_delta import PoseDelta, apply_delta
-from posekit.nets.weights import Networks
 from posekit.render import Light, Renderer
 from posekit.results import Detection
 from posekit.view import View
-from posekit.zoom import box_window, frontal_camera, frontal_pose, zoom_to_box
+from posekit.zoom import box_window, zoom_to_box
 
 Array = NDArray[np.float64]
 FArray = NDArray[np.float32]
 
+TEMPLATE_VERSION = 1  # of what is kept on disk; a change of the views raises it
 TEMPLATE = 64  # side of the box search's templates, pixels
 JUDGED = 96  # side of the window in which poses are judged, pixels
 FINER = 2  # times as fine as it is compared, a crop is kept
@@ -104,19 +101,50 @@ def _patch(image: NDArray[np.uint8], mask: NDArray[np.uint8], size: int, turn: f
     return _Patch(soft.astype(np.float32), colour, middle @ R, half)
 
 
+def template_views(model: ObjectModel, renderer: Renderer, count: int) -> list[View]:
+    """The mesh from ``count`` directions spread over the sphere, each with its mask: from the user's cache, else
+    rendered and kept there."""
+    _, camera = _template_camera(model)
+    file = cache_file(f"templates-{count}", model, TEMPLATE_VERSION)
+    kept = read_arrays(file)
+    shape = (count, TEMPLATE, TEMPLATE)
+    if kept is not None and set(kept) == {"images", "masks"} and kept["masks"].shape == shape:
+        return [View(image, camera, mask) for image, mask in zip(kept["images"], kept["masks"], strict=True)]
+    views = _rendered(model, renderer, count, camera)
+    masks = np.stack([np.asarray(view.mask, np.bool_) for view in views])
+    keep_arrays(file, {"images": np.stack([view.image for view in views]), "masks": masks})
+    return views
+
+
+def _template_camera(model: ObjectModel) -> tuple[float, Camera]:
+    """The distance of the templates' camera, metres, and the camera."""
+    distance = 4.0 * model.diameter
+    focal, middle = 0.9 * TEMPLATE * distance / model.diameter, 0.5 * TEMPLATE - 0.5
+    return distance, Camera(focal, focal, middle, middle, TEMPLATE, TEMPLATE)
+
+
+def _rendered(model: ObjectModel, renderer: Renderer, count: int, camera: Camera) -> list[View]:
+    distance, _ = _template_camera(model)
+    rotations = [view_rotation(d) for d in fibonacci_sphere(count)]
+    poses = [Pose(R, np.array([0, 0, distance])) @ model.T_ctr_obj for R in rotations]
+    return renderer.render(model, poses, camera, light=Light(), coords=False)
+
+
+class FirstPoseSearch(Protocol):
+    """Whatever gives first poses for a detection."""
+
+    def search(self, view: View, detection: Detection, count: int) -> list[Hypothesis]:
+        """At most ``count`` ``T_cam_obj``, best first."""
+
+
 class TemplateSearch:
     """First poses by comparison with rendered templates; the templates are made once per mesh."""
 
     def __init__(self, model: ObjectModel, renderer: Renderer, options: TemplateOptions = TemplateOptions()) -> None:
         self.model, self.options = model, options
         self.rotations = [view_rotation(d) for d in fibonacci_sphere(options.views)]
-        side = 64
-        self.distance = 4.0 * model.diameter
-        focal = 0.9 * side * self.distance / model.diameter
-        self.camera = Camera(focal, focal, 0.5 * side - 0.5, 0.5 * side - 0.5, side, side)
-        T_ctr_obj = model.T_ctr_obj
-        poses = [Pose(R, np.array([0, 0, self.distance])) @ T_ctr_obj for R in self.rotations]
-        views = renderer.render(model, poses, self.camera, light=Light(), coords=False)
+        self.distance, self.camera = _template_camera(model)
+        views = template_views(model, renderer, options.views)
         found = [_patch(v.image, _u8(v.mask), options.size) for v in views]
         self.kept = [k for k, patch in enumerate(found) if patch is not None]
         self.patches = [patch for patch in found if patch is not None]
@@ -247,11 +275,8 @@ class BoxSearch:
         """Raises PromptError where the mesh leaves no silhouette."""
         self.model, self.options, self.weights = model, options, weights_for(model, options.weights)
         self.rotations = [view_rotation(d) for d in fibonacci_sphere(options.views)]
-        self.distance = 4.0 * model.diameter
-        focal = 0.9 * TEMPLATE * self.distance / model.diameter
-        self.camera = Camera(focal, focal, 0.5 * TEMPLATE - 0.5, 0.5 * TEMPLATE - 0.5, TEMPLATE, TEMPLATE)
-        poses = [Pose(R, np.array([0, 0, self.distance])) @ model.T_ctr_obj for R in self.rotations]
-        views = renderer.render(model, poses, self.camera, light=Light(), coords=False)
+        self.distance, self.camera = _template_camera(model)
+        views = template_views(model, renderer, options.views)
         turns = np.arange(options.turns // 4) * (2 * np.pi / options.turns)
         found = [self._place(k, view, turn) for k, view in enumerate(views) for turn in turns]
         usable = [each for each in found if each is not None]
@@ -379,47 +404,6 @@ class EvidenceScorer:
         masks = [np.asarray(each.mask, np.bool_) for each in drawn]
         scores = Silhouettes.of(masks, [each.image for each in drawn]).scores(self.picture, self.weights)
         return [float(score) if mask.any() else 0.0 for score, mask in zip(scores, masks, strict=True)]
-
-
-class MVNetSearch:
-    """The paper's first pose: MV-Net compares the crop with the six views of a cube's faces (section 3.2).
-
-    The views are rendered once per mesh, each as a crop round its own box would show it. The answer is relative to
-    the frontal view, placed at the detection box's centre, at the depth at which it looks as large in the crop as it
-    was rendered: so the box's size gives the first depth.
-    """
-
-    def __init__(self, model: ObjectModel, networks: Networks, renderer: Renderer) -> None:
-        if networks.mvnet is None:
-            raise WeightsError(
-                f"the {networks.preset} weights {networks.digest} hold no trained MV-Net: use --init templates."
-            )
-        self.model, self.size, self.mvnet = model, networks.size, networks.mvnet
-        self.rotations = cube_views()
-        self.camera, self.distance = frontal_camera(model, networks.size)
-        poses = [Pose(R, np.array([0, 0, self.distance])) @ model.T_ctr_obj for R in self.rotations]
-        views = renderer.render(model, poses, self.camera, coords=False)
-        self.device = networks.device
-        self.views = torch.from_numpy(np.stack([to_input(v.image, v.mask) for v in views])).to(self.device)
-
-    def search(self, view: View, detection: Detection, count: int) -> list[Hypothesis]:
-        """One first pose; ``count`` is an upper bound, as for every search. Empty where it lies behind the camera."""
-        mask = detection.mask if detection.mask is not None else box_mask(detection.box, view.camera)
-        crop = view.with_mask(mask).zoomed(zoom_to_box(view.camera, detection.box, self.size))
-        observed = torch.from_numpy(to_input(crop.image, crop.mask))[None].to(self.device)
-        with torch.inference_mode():
-            out = self.mvnet(observed, self.views[None])
-        quat_wxyz, v = (x[0].double().cpu().numpy() for x in (out.quat_wxyz, out.v))
-        delta = PoseDelta(quat_to_rotation(quat_wxyz), v)
-        target = apply_delta(self.frontal(crop.camera), delta, crop.camera.fx)
-        if not np.isfinite(target.matrix).all() or target.t[2] < 0.6 * self.model.diameter:
-            return []
-        T_cam_view = Pose.rotation(crop.R_view_cam.T)
-        return [Hypothesis(T_cam_view @ target @ self.model.T_ctr_obj, 1.0)][:count]
-
-    def frontal(self, crop_camera: Camera) -> Pose:
-        """The ``T_view_ctr`` to which MV-Net's answer is relative."""
-        return frontal_pose(self.camera, self.distance, crop_camera)
 
 
 def _is_apart(pose: Pose, found: Sequence[Hypothesis], model: ObjectModel, angle: float) -> bool:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -13,16 +12,19 @@ from numpy.typing import NDArray
 
 from posekit.align.pnp import PnpConfig, solve_pnp
 from posekit.camera import Camera, Zoom
-from posekit.first_pose.hypotheses import Hypothesis, MVNetSearch
+from posekit.errors import WeightsError
+from posekit.first_pose.hypotheses import FirstPoseSearch, Hypothesis, box_mask
 from posekit.first_pose.view_bank import DISTANCE, TURNS, ViewBank
-from posekit.geometry import Pose, rotation_angle, rotation_between, so3_exp
+from posekit.geometry import Pose, cube_views, quat_to_rotation, rotation_angle, rotation_between, so3_exp
 from posekit.mesh.model import ObjectModel
+from posekit.nets.inputs import to_input
 from posekit.nets.mvnet import CELL, GRID, NONE, VIEW, Encoded, Matches, MatchingMVNet, rgb_input, view_input
+from posekit.nets.pose_delta import PoseDelta, apply_delta
 from posekit.nets.weights import Networks
 from posekit.render import Renderer
 from posekit.results import Detection
 from posekit.view import View
-from posekit.zoom import zoom_to_box
+from posekit.zoom import frontal_camera, frontal_pose, zoom_to_box
 
 Array = NDArray[np.float64]
 FArray = NDArray[np.float32]
@@ -30,7 +32,7 @@ FArray = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class MatchingOptions:
-    """How MV-Net's answers become poses."""
+    """How MV-Net's outputs become poses."""
 
     enlarge: float = 1.35  # the crop's size in boxes, as in training
     likely: float = 0.08  # least probability of a correspondence;
@@ -42,17 +44,9 @@ class MatchingOptions:
     refine: PnpConfig = PnpConfig(iterations=8, min_points=6)  # the last solve
 
 
-class FirstPoseSearch(Protocol):
-    """Whatever gives first poses for a detection."""
-
-    def search(self, view: View, detection: Detection, count: int) -> list[Hypothesis]:
-        """At most ``count`` ``T_cam_obj``, best first."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class Examined:
-    """What MV-Net says of a detection. hypotheses: best first. mask: bool (H, W), the visible object in the photograph.
+    """MV-Net's output for a detection. hypotheses: best first. mask: bool (H, W), the visible object in the photograph.
     existence_score: probability that the box shows the mesh."""
 
     hypotheses: list[Hypothesis]
@@ -61,7 +55,7 @@ class Examined:
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class MatchingOutput:
     """Of the network for one crop. templates: int64 (k,). matches: float32 arrays without the batch's axis, named as in
     `Matches`."""
 
@@ -74,7 +68,7 @@ class Answer:
     presence: float
 
     @classmethod
-    def of(cls, templates: NDArray[np.int64], matches: Matches) -> Answer:
+    def of(cls, templates: NDArray[np.int64], matches: Matches) -> MatchingOutput:
         """matches: of a batch of one."""
         cells, offsets, silhouettes, scores, turns, presence = (t[0].float().cpu().numpy() for t in matches)
         return cls(templates, cells, offsets, silhouettes, scores, turns, float(presence))
@@ -101,6 +95,47 @@ def mvnet_search(model: ObjectModel, networks: Networks, renderer: Renderer) -> 
     return MVNetSearch(model, networks, renderer)
 
 
+class MVNetSearch:
+    """The paper's first pose: MV-Net compares the crop with the six views of a cube's faces (section 3.2).
+
+    The views are rendered once per mesh, each as a crop round its own box would show it. The answer is relative to
+    the frontal view, placed at the detection box's centre, at the depth at which it looks as large in the crop as it
+    was rendered: so the box's size gives the first depth.
+    """
+
+    def __init__(self, model: ObjectModel, networks: Networks, renderer: Renderer) -> None:
+        if networks.mvnet is None:
+            raise WeightsError(
+                f"the {networks.preset} weights {networks.digest} hold no trained MV-Net: use --init templates."
+            )
+        self.model, self.size, self.mvnet = model, networks.size, networks.mvnet
+        self.rotations = cube_views()
+        self.camera, self.distance = frontal_camera(model, networks.size)
+        poses = [Pose(R, np.array([0, 0, self.distance])) @ model.T_ctr_obj for R in self.rotations]
+        views = renderer.render(model, poses, self.camera, coords=False)
+        self.device = networks.device
+        self.views = torch.from_numpy(np.stack([to_input(v.image, v.mask) for v in views])).to(self.device)
+
+    def search(self, view: View, detection: Detection, count: int) -> list[Hypothesis]:
+        """One first pose; ``count`` is an upper bound, as for every search. Empty where it lies behind the camera."""
+        mask = detection.mask if detection.mask is not None else box_mask(detection.box, view.camera)
+        crop = view.with_mask(mask).zoomed(zoom_to_box(view.camera, detection.box, self.size))
+        observed = torch.from_numpy(to_input(crop.image, crop.mask))[None].to(self.device)
+        with torch.inference_mode():
+            out = self.mvnet(observed, self.views[None])
+        quat_wxyz, v = (x[0].double().cpu().numpy() for x in (out.quat_wxyz, out.v))
+        delta = PoseDelta(quat_to_rotation(quat_wxyz), v)
+        target = apply_delta(self.frontal(crop.camera), delta, crop.camera.fx)
+        if not np.isfinite(target.matrix).all() or target.t[2] < 0.6 * self.model.diameter:
+            return []
+        T_cam_view = Pose.rotation(crop.R_view_cam.T)
+        return [Hypothesis(T_cam_view @ target @ self.model.T_ctr_obj, 1.0)][:count]
+
+    def frontal(self, crop_camera: Camera) -> Pose:
+        """The ``T_view_ctr`` to which MV-Net's answer is relative."""
+        return frontal_pose(self.camera, self.distance, crop_camera)
+
+
 class MatchingSearch:
     """First poses of one mesh by a trained `MatchingMVNet`; its views are encoded once."""
 
@@ -116,25 +151,25 @@ class MatchingSearch:
         self.encoded = Encoded(*(torch.cat(parts) for parts in zip(*chunks, strict=True)))
 
     def search(self, view: View, detection: Detection, count: int) -> list[Hypothesis]:
-        """The best ``count`` first poses for a detection's box, best first; its mask is not looked at."""
+        """The best ``count`` first poses for a detection's box, best first; its mask is not used."""
         return self.examine(view, detection, count).hypotheses
 
     def examine(self, view: View, detection: Detection, count: int) -> Examined:
-        """As `search`, with the mask and the presence."""
+        """As `search`, with the mask and the existence score."""
         zoom = zoom_to_box(view.camera, detection.box, self.mvnet.config.size, enlarge=self.options.enlarge)
-        answer = self.answer(view.zoomed(zoom))
+        output = self.output(view.zoomed(zoom))
         found: list[Hypothesis] = []
-        for pose, score in self._candidates(answer, zoom.camera):
+        for pose, score in self._candidates(output, zoom.camera):
             if all(rotation_angle(pose.R.T @ h.T_cam_obj.R) > self.options.apart for h in found):
                 found.append(Hypothesis(pose, score))
             if len(found) == count:
                 break
         back = Pose.rotation(zoom.R_view_cam.T)
         placed = [Hypothesis(back @ h.T_cam_obj @ self.model.T_ctr_obj, h.score) for h in found]
-        presence = 1.0 / (1.0 + float(np.exp(-np.clip(answer.presence, -30, 30))))
-        return Examined(placed, photo_mask(answer.silhouettes[0], zoom), presence)
+        presence = 1.0 / (1.0 + float(np.exp(-np.clip(output.presence, -30, 30))))
+        return Examined(placed, photo_mask(output.silhouettes[0], zoom), presence)
 
-    def answer(self, crop: View) -> Answer:
+    def output(self, crop: View) -> MatchingOutput:
         """Run the network on a crop of its size."""
         observed = rgb_input(torch.from_numpy(crop.image)[None].to(self.device))
         with torch.inference_mode():
@@ -142,39 +177,39 @@ class MatchingSearch:
             logits = self.mvnet.select(seen, *(t[None] for t in self.encoded[1:]))
             best = logits[0].topk(min(self.mvnet.kept, len(self.rotations))).indices
             matches = self.mvnet.compare(seen.fine, seen.tokens, self.encoded.tokens[best][None])
-        return Answer.of(best.cpu().numpy(), matches)
+        return MatchingOutput.of(best.cpu().numpy(), matches)
 
-    def _candidates(self, answer: Answer, camera: Camera) -> list[tuple[Pose, float]]:
+    def _candidates(self, output: MatchingOutput, camera: Camera) -> list[tuple[Pose, float]]:
         """``T_crop_ctr`` and score: solved where a view has enough inliers, else composed; best first."""
-        found = [self._correspondences(answer, row) for row in range(len(answer.templates))]
+        found = [self._correspondences(output, row) for row in range(len(output.templates))]
         every = _Points.joined(found)
-        sure = 1 / (1 + np.exp(-answer.scores.astype(np.float64)))
-        order = np.argsort(-sure)
-        poses = [(self._solved(found[row], camera) or self._composed(answer, int(row), camera), sure[row])
+        probability = 1 / (1 + np.exp(-output.scores.astype(np.float64)))
+        order = np.argsort(-probability)
+        poses = [(self._solved(found[row], camera) or self._composed(output, int(row), camera), probability[row])
                  for row in order]  # fmt: skip
         together = self._solved(_Points.joined([found[row] for row in order[: self.options.pooled]]), camera)
         if together is not None:
-            poses.append((together, sure[order[0]]))
+            poses.append((together, probability[order[0]]))
         usable = [(pose, share) for pose, share in poses if pose.t[2] > 0.6 * self.model.diameter]
         scored = [(pose, self._support(pose, every, camera) + 0.2 * float(share)) for pose, share in usable]
         return sorted(scored, key=lambda pair: -pair[1])
 
-    def _correspondences(self, answer: Answer, row: int) -> _Points:
+    def _correspondences(self, output: MatchingOutput, row: int) -> _Points:
         """Of one view, from the cells that are more likely in it than not and lie on the mesh there."""
-        logits = answer.cells[row].astype(np.float64)
+        logits = output.cells[row].astype(np.float64)
         share = np.exp(logits - logits.max(1, keepdims=True))
         share /= share.sum(1, keepdims=True)
         cell = share[:, :NONE].argmax(1)
         weight = share[np.arange(len(cell)), cell]
-        offset = answer.offsets[row].reshape(2, -1).T.clip(-0.75, 0.75)
+        offset = output.offsets[row].reshape(2, -1).T.clip(-0.75, 0.75)
         place = (np.stack([cell % GRID, cell // GRID], axis=1) + 0.5 + offset) * CELL - 0.5
         u, v = np.rint(place).astype(int).clip(0, VIEW - 1).T
-        points = self.bank.template_coords(int(answer.templates[row]))[v, u].astype(np.float64)
+        points = self.bank.template_coords(int(output.templates[row]))[v, u].astype(np.float64)
         there = 1.0 - share[:, NONE] > self.options.present
         kept = there & (weight > self.options.likely) & (np.abs(points).sum(1) > 0)
         columns = self.mvnet.columns
-        home = np.arange(len(cell))
-        pixels = np.stack([home % columns, home // columns], axis=1) * CELL + 0.5 * (CELL - 1)
+        index = np.arange(len(cell))
+        pixels = np.stack([index % columns, index // columns], axis=1) * CELL + 0.5 * (CELL - 1)
         return _Points(points[kept] * self.model.diameter, pixels[kept], weight[kept])
 
     def _solved(self, found: _Points, camera: Camera) -> Pose | None:
@@ -198,14 +233,14 @@ class MatchingSearch:
         points, pixels, weight = found.points[kept], found.pixels[kept], found.weight[kept]
         return solve_pnp(points, pixels, weight, scale, camera, start, self.options.refine) or start
 
-    def _composed(self, answer: Answer, row: int, camera: Camera) -> Pose:
+    def _composed(self, output: MatchingOutput, row: int, camera: Camera) -> Pose:
         """The view turned in the picture, as large and where the amodal silhouette is."""
-        template = int(answer.templates[row])
+        template = int(output.templates[row])
         mask = np.rot90(self.bank.pictures[template // TURNS, ..., 3], template % TURNS) > 0
         drawn = self.bank.template_camera(template)
-        turn = float(np.arctan2(answer.turns[row, 1], answer.turns[row, 0]))
+        turn = float(np.arctan2(output.turns[row, 1], output.turns[row, 0]))
         c, s = np.cos(turn), np.sin(turn)
-        area, centre = _extent(answer.silhouettes[1], camera, self.options.enlarge)
+        area, centre = _extent(output.silhouettes[1], camera, self.options.enlarge)
         scale = np.sqrt(area / max(1, mask.sum()))
         rows, columns = np.nonzero(mask)
         beside = np.array([columns.mean() - drawn.cx, rows.mean() - drawn.cy]) if rows.size else np.zeros(2)

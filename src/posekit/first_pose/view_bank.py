@@ -41,9 +41,13 @@ class ViewBank:
 
     @classmethod
     def of(
-        cls, model: ObjectModel, renderer: Renderer, directions: Array | None = None, look: ObjectModel | None = None
+        cls,
+        model: ObjectModel,
+        renderer: Renderer,
+        directions: Array | None = None,
+        coloured: ObjectModel | None = None,
     ) -> ViewBank:
-        """directions: (M, 3), where the camera stands; `VIEWS` even ones where not given. look: the mesh in other
+        """directions: (M, 3), where the camera stands; `VIEWS` even ones where not given. coloured: the mesh in other
         colours, where it is to be drawn so."""
         rotations = np.stack(
             [view_rotation(d) for d in (fibonacci_sphere(VIEWS) if directions is None else directions)]
@@ -53,7 +57,7 @@ class ViewBank:
         cameras = [Camera(f, f, cx, cy, VIEW, VIEW) for f, cx, cy in inside]
         place = np.array([0.0, 0.0, DISTANCE * model.diameter])
         poses = [Pose(R, place) @ model.T_ctr_obj for R in rotations]
-        drawn = renderer.render(model if look is None else look, poses, cameras, light=HEADLIGHT)
+        drawn = renderer.render(model if coloured is None else coloured, poses, cameras, light=HEADLIGHT)
         masks = np.stack([np.asarray(v.mask) for v in drawn])
         coords = (np.stack([np.asarray(v.coords) for v in drawn]) - model.center) / model.diameter
         pictures = np.concatenate([np.stack([v.image for v in drawn]), masks[..., None] * np.uint8(255)], axis=3)
@@ -75,6 +79,7 @@ class ViewBank:
         return np.rot90(self.coords[index // TURNS], index % TURNS).astype(np.float32)
 
     def template_camera(self, index: int) -> Camera:
+        """The camera that template ``index`` was rendered with, turned with its picture; square, pixels."""
         f, cx, cy = self.intrinsics[index // TURNS]
         for _ in range(index % TURNS):
             cx, cy = cy, VIEW - 1 - cx

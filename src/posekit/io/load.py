@@ -1,4 +1,4 @@
-"""What people hand over: photographs, masks, boxes, cameras, poses."""
+"""Input from people: photographs, masks, boxes, cameras, poses."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from posekit.camera import Box, Camera
-from posekit.errors import CameraError, ImageError, InputError, PromptError
+from posekit.errors import ImageError, InputError, PromptError
 from posekit.geometry import Pose, nearest_rotation
 from posekit.io.calibration import Calibration, load_calibration
 from posekit.io.files import other_content, read_text
@@ -75,9 +75,9 @@ def load_image(path: str | Path) -> NDArray[np.uint8]:
     """A picture as uint8 RGB (H, W, 3), turned upright as its EXIF data says.
 
     Grey and palette pictures become RGB, transparent parts black. 16 bits become 8 by the range that is used: 10 or 12
-    bits in a file of 16 are seen by their largest value, and said. Damaged EXIF data do not stop a good picture.
-    Raises ImageError where the file is missing, no picture, damaged, smaller than 16 pixels or over 100 megapixels
-    (POSEKIT_MOST_PIXELS). A JPEG that lacks a few of its last rows alone is read, and told.
+    bits in a file of 16 are recognised by their largest value, which is logged. Damaged EXIF data do not stop a good
+    picture. Raises ImageError where the file is missing, no picture, damaged, smaller than 16 pixels or over 100
+    megapixels (POSEKIT_MOST_PIXELS). A JPEG that lacks a few of its last rows alone is read, which is logged.
     """
     path = Path(path)
     with _opened(path, "picture", ImageError) as image:
@@ -104,7 +104,7 @@ def load_image(path: str | Path) -> NDArray[np.uint8]:
 def load_mask(path: str | Path, size: Size | None = None, *, allow_empty: bool = False) -> NDArray[np.bool_]:
     """A mask (H, W) from a picture: True where a pixel is brighter than half of the brightest (and not transparent).
 
-    A pixel's brightness is its brightest channel. Values in between, as JPEG makes them, are said; a picture of a few
+    A pixel's brightness is its brightest channel. Values in between, as JPEG makes them, are logged; a picture of a few
     small numbers is one of labels, and refused. size: (width, height) that it must have. Raises PromptError where it
     has another, is no picture, or is empty and may not be.
     """
@@ -174,7 +174,7 @@ def _opened(path: Path, what: str, kind: type[InputError]) -> Iterator[Image.Ima
 
 
 def _cut_short(path: Path, image: Image.Image, error: OSError) -> Image.Image:
-    """A baseline JPEG whose file ends a little early, as OpenCV reads it, which is told. Raises the given error
+    """A baseline JPEG whose file ends a little early, as OpenCV reads it, which is logged. Raises the given error
     for other pictures, and OSError where more than a few rows are missing."""
     if image.format not in ("JPEG", "MPO") or image.info.get("progressive"):
         raise error
@@ -198,7 +198,7 @@ def _exif(image: Image.Image) -> dict[int, Any]:
     try:
         with warnings.catch_warnings(action="ignore"):
             return dict(image.getexif())
-    except Exception:  # Pillow raises what its parser stumbles over
+    except Exception:  # Pillow's parsers raise many kinds of errors
         return {}
 
 
@@ -295,7 +295,7 @@ def camera_from_exif(path: str | Path, size: Size) -> Camera | None:
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
             exif = image.getexif().get_ifd(0x8769)
-    except Exception:  # Pillow raises what its parser stumbles over, and metadata never stop a good picture
+    except Exception:  # Pillow's parsers raise many kinds of errors, and metadata never stop a good picture
         return None
     longer, shorter = max(size), min(size)
     taken = sorted((_positive(exif.get(0xA002)), _positive(exif.get(0xA003))))
@@ -320,21 +320,6 @@ def _positive(value: Any) -> float:
     except (TypeError, ValueError, ZeroDivisionError):
         return 0.0
     return number if math.isfinite(number) and number > 0 else 0.0
-
-
-def load_camera(source: str | Path, size: Size, image: str | Path | None = None) -> Camera:
-    """The camera of a picture of ``size`` (width, height), as `load_calibration` finds it.
-
-    Raises CameraError, also where it has lens distortion: a Camera has none, so load_view undistorts the picture too.
-    """
-    found = load_calibration(source, size, image)
-    if found.lens is not None:
-        raise CameraError(
-            f"{source} has lens distortion ({', '.join(f'{v:g}' for v in found.lens.coefficients)}), which a Camera "
-            "has not: load the photograph with posekit.io.load.load_view, or take the camera and the lens from "
-            "posekit.io.calibration.load_calibration."
-        )
-    return found.camera
 
 
 # --- poses ------------------------------------------------------------------------------------------------------

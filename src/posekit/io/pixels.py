@@ -28,7 +28,8 @@ _TURNS = {
 
 
 def eight_bit(values: NDArray[np.integer], label: str) -> NDArray[np.uint8]:
-    """Whole numbers up to 65535 as 8 bits, by the range that is used: 8, 10, 12, 14 or 16 bits; what is taken is said.
+    """Whole numbers up to 65535 as 8 bits, by the range that is used: 8, 10, 12, 14 or 16 bits; what is taken is
+    logged.
 
     Raises ValueError where a value is negative or larger.
     """
@@ -111,7 +112,7 @@ def upright(image: Image.Image, label: str) -> Image.Image:
     try:
         with warnings.catch_warnings(action="ignore"):
             return ImageOps.exif_transpose(image)
-    except Exception as error:  # Pillow raises what its parser stumbles over, or its writer when it keeps the rest
+    except Exception as error:  # Pillow's parsers and writers raise many kinds of errors
         turn = _TURNS.get(orientation(image))
         log.warning(
             "%s: its EXIF data are damaged (%s); the picture is read %s.",
@@ -125,6 +126,6 @@ def orientation(image: Image.Image) -> int:
     try:
         with warnings.catch_warnings(action="ignore"):
             found = image.getexif().get(ExifTags.Base.Orientation, 1)
-    except Exception:  # Pillow raises what its parser stumbles over, and metadata never stop a good picture
+    except Exception:  # Pillow's parsers raise many kinds of errors, and metadata never stop a good picture
         return 1
     return found if isinstance(found, int) and 1 <= found <= 8 else 1

@@ -58,6 +58,7 @@ class NamedPose:
 
     @property
     def stamp(self) -> float:
+        """Seconds where they are known, else the frame's number."""
         return float(self.frame) if self.seconds is None else self.seconds
 
 

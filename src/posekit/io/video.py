@@ -1,4 +1,4 @@
-"""Frames in and out: videos, folders of pictures, BOP scenes, cameras. The only door to PyAV."""
+"""Frames in and out: videos, folders of pictures, BOP scenes, cameras. The only module that imports PyAV."""
 
 from __future__ import annotations
 
@@ -56,10 +56,12 @@ class Frames(Protocol):
     """Frames one after the other. count: how many there are, where that is known before. rate: frames a second."""
 
     @property
-    def count(self) -> int | None: ...
+    def count(self) -> int | None:
+        """How many frames there are; None where that is not known before."""
 
     @property
-    def rate(self) -> float: ...
+    def rate(self) -> float:
+        """Frames a second."""
 
     def __iter__(self) -> Iterator[Frame]: ...
 
@@ -134,7 +136,7 @@ def _natural(path: Path) -> list[tuple[int, int, str]]:
 
 
 class _Intrinsics:
-    """The camera of each frame: by its size where it is given, of pictures by their EXIF data else; told once."""
+    """The camera of each frame: by its size where it is given, of pictures by their EXIF data else; logged once."""
 
     def __init__(self, camera: str | Path | None) -> None:
         self.given, self.known = camera, dict[tuple[Any, ...], Calibration]()
@@ -240,7 +242,7 @@ class SceneFrames:
 
 
 class VideoFrames:
-    """A video file, by PyAV. What cannot be decoded is told frame by frame; a truncated file ends early."""
+    """A video file, by PyAV. What cannot be decoded is reported frame by frame; a truncated file ends early."""
 
     def __init__(self, path: Path, camera: str | Path | _NoCamera | None) -> None:
         self.path, self._cameras = path, _cameras_of(camera)
@@ -349,7 +351,7 @@ class CameraFrames:
 
 
 class ReadAhead:
-    """Frames of a source that is read beside the work on them, a few ahead.
+    """Frames of a source that is read in a thread of its own, a few ahead.
 
     latest: always the newest one; what comes while another is worked on is dropped. Whoever reads is then at most one
     frame behind a camera, however slow. For cameras; of a file almost all is dropped.
@@ -382,7 +384,7 @@ def _read(source: Frames, waiting: Queue[Frame | BaseException | None], ended: E
                     waiting.get_nowait()
             if not _handed_on(frame, waiting, ended):
                 return
-    except BaseException as error:  # told to whoever reads
+    except BaseException as error:  # raised where the frames are read
         last = error
     _handed_on(last, waiting, ended)
 

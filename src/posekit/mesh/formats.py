@@ -1,4 +1,4 @@
-"""What mesh files hold that trimesh reads wrongly or not, put right or named before it does."""
+"""What mesh files hold that trimesh reads wrongly or not, corrected or reported before it does."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from posekit.errors import MeshError
-from posekit.mesh.gltf import gltf_put_right
+from posekit.mesh.gltf import corrected_gltf
 from posekit.mesh.ply import triangles_alone
 from posekit.mesh.polygons import triangulated
 
@@ -24,7 +24,7 @@ _CHANNELS = (
 )  # fmt: skip
 
 
-def put_right(kind: str, data: bytes, label: str, fetch: Callable[[str], bytes]) -> bytes:
+def corrected(kind: str, data: bytes, label: str, fetch: Callable[[str], bytes]) -> bytes:
     """A file's bytes as trimesh reads them rightly. kind: its suffix with the dot. fetch: gives the bytes of a file
     that it names. Raises MeshError."""
     if kind == ".obj":
@@ -34,7 +34,7 @@ def put_right(kind: str, data: bytes, label: str, fetch: Callable[[str], bytes])
     if kind == ".ply":
         return triangles_alone(data, label)
     if kind in (".glb", ".gltf"):
-        return gltf_put_right(kind, data, label, fetch)
+        return corrected_gltf(kind, data, label, fetch)
     return data
 
 
@@ -180,7 +180,7 @@ def ply_faces(
         chosen = np.flatnonzero(lengths == count)
         corners = np.stack([np.asarray(polygons[k], dtype=np.int64) for k in chosen])
         if corners.min() < 0 or corners.max() >= len(vertices):
-            return None  # told where faces are checked
+            return None  # reported where faces are checked
         triples = triangulated(vertices[corners], label)
         faces += [face[cut] for face, cut in zip(corners, triples, strict=True)]
         sources.append(np.repeat(chosen, [len(cut) for cut in triples]))
@@ -199,7 +199,7 @@ def _polygons(data: Any) -> Any:
 
 def ply_colours(element: Mapping[str, Any] | None, count: int, label: str) -> NDArray[np.uint8] | None:
     """The colours (count, 3) of a PLY's vertices or faces, in whatever numbers; None without any. What is not
-    understood is told."""
+    understood is logged."""
     data, properties = (None, ()) if element is None else (element.get("data"), tuple(element.get("properties", ())))
     spelled = {name.lower(): name for name in properties}
     for names in _CHANNELS:
@@ -214,7 +214,7 @@ def ply_colours(element: Mapping[str, Any] | None, count: int, label: str) -> ND
 
 
 def colours_8bit(colours: NDArray[Any], label: str) -> NDArray[np.uint8] | None:
-    """Colours (N, 3) as 0 to 255: fractions up to 1, numbers up to 255, or 16 bits; None, and told, for others."""
+    """Colours (N, 3) as 0 to 255: fractions up to 1, numbers up to 255, or 16 bits; None, and logged, for others."""
     if colours.dtype == np.uint8:
         return np.asarray(colours)
     values = colours.astype(np.float64)

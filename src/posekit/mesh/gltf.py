@@ -33,7 +33,7 @@ _UNDERSTOOD = {
 _WRONG = (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, struct.error)
 
 
-def gltf_put_right(kind: str, data: bytes, label: str, fetch: Callable[[str], bytes]) -> bytes:
+def corrected_gltf(kind: str, data: bytes, label: str, fetch: Callable[[str], bytes]) -> bytes:
     """A file's bytes with texture transforms (KHR_texture_transform) and the chosen set of texture coordinates applied,
     the colours of KHR_materials_pbrSpecularGlossiness where trimesh finds them, and embedded textures of 16 bits made
     8. Transparent parts are told: they are drawn solid.

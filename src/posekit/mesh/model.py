@@ -66,7 +66,7 @@ class ObjectModel:
         """Read a PLY, OBJ (with MTL and textures), GLB, glTF or STL file.
 
         units: "mm", "cm", "m", "in" (inches), or "auto": metres where the diameter is below 3, millimetres where it is
-        above 20; what is taken is said, with the object's length.
+        above 20; what is taken is logged, with the object's length.
         symmetry: a text for `Symmetries.parse`, a JSON file's name, or symmetries; otherwise they are read from a
         ``models_info.json`` beside the mesh (``obj_000009.ply`` by its number, other names by their stem).
 
@@ -209,13 +209,3 @@ class ObjectModel:
             vertices, kept, name=self.name, colors=colors, uvs=uvs, texture=self.texture, symmetries=self.symmetries
         )
         return replace(model, units=self.units)
-
-    def sample_points(self, n: int, seed: int = 0) -> Floats:
-        """(n, 3) points spread evenly over the surface, in ``obj``. The same seed gives the same points."""
-        rng = np.random.default_rng(seed)
-        corners = self.vertices.astype(np.float64)[self.faces]
-        share = np.cumsum(face_areas(self.vertices.astype(np.float64), self.faces))
-        chosen = corners[np.searchsorted(share, rng.random(n) * share[-1]).clip(max=len(share) - 1)]
-        a, b = rng.random((2, n, 1))
-        root = np.sqrt(a)
-        return np.asarray((1 - root) * chosen[:, 0] + root * (1 - b) * chosen[:, 1] + root * b * chosen[:, 2])

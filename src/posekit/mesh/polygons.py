@@ -1,4 +1,4 @@
-"""Polygons cut into triangles, concave ones too. The only door to mapbox_earcut."""
+"""Polygons cut into triangles, concave ones too. The only module that imports mapbox_earcut."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def triangulated(points: NDArray[np.float64], label: str) -> list[Triples]:
     """Triangles (M, 3), as numbers of corners, of each of n polygons with L corners: points (n, L, 3), in order.
 
     Convex ones become fans. A polygon in space is cut as it lies in its mean plane. Raises MeshError where one crosses
-    itself, so that nobody can tell what it encloses; label: the mesh's name.
+    itself, so that what it encloses is not defined; label: the mesh's name.
     """
     count = points.shape[1]
     fan = np.array([(0, k, k + 1) for k in range(1, count - 1)], dtype=np.int64)

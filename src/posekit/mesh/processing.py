@@ -31,9 +31,9 @@ def smooth_normals(vertices: Floats, faces: NDArray[np.int64]) -> tuple[NDArray[
     total, left, step = weighted.copy(), np.arange(len(order)), 1
     while left.size:  # each corner meets the one that lies `step` further on at the same place
         left = left[left + step < ends[left]]
-        alike = left[np.einsum("ij,ij->i", normal[left], normal[left + step]) > _CREASE]
-        total[alike] += weighted[alike + step]
-        total[alike + step] += weighted[alike]
+        smooth = left[np.einsum("ij,ij->i", normal[left], normal[left + step]) > _CREASE]
+        total[smooth] += weighted[smooth + step]
+        total[smooth + step] += weighted[smooth]
         step += 1
     unit = np.empty_like(total)
     length = np.linalg.norm(total, axis=1, keepdims=True)
@@ -65,6 +65,7 @@ def coincident(vertices: Floats) -> NDArray[np.int64]:
 
 
 def face_areas(vertices: Floats, faces: NDArray[Any]) -> Floats:
+    """Areas (F,) of faces (F, 3) of vertices (V, 3), in the vertices' unit squared."""
     corners = vertices[faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return np.asarray(0.5 * np.linalg.norm(cross, axis=1))
@@ -94,7 +95,9 @@ def carried_uvs(
     _, under = KDTree(corners.mean(axis=1)).query(new.mean(axis=1))
     origin, first, second = np.moveaxis(corners[under].astype(np.float64), 1, 0)
     sides = np.stack([first - origin, second - origin], axis=2)  # (F', 3, 2)
-    shares = np.einsum("fij,fkj->fki", np.linalg.pinv(sides), new - origin[:, None]).clip(-4, 4)  # a sliver's explode
+    shares = np.einsum("fij,fkj->fki", np.linalg.pinv(sides), new - origin[:, None]).clip(
+        -4, 4
+    )  # unbounded for slivers
     start = corner_uvs[under, 0].astype(np.float64)
     across = corner_uvs[under, 1:].astype(np.float64) - start[:, None]
     uvs = (start[:, None] + shares @ across).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""Mesh files as trimesh reads them, with what it leaves out; the only door to trimesh."""
+"""Mesh files as trimesh reads them, with what it leaves out; the only module that imports trimesh."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from posekit.io.files import other_content
 from posekit.io.limits import limit
 from posekit.io.pixels import deep_colour, eight_bit
 from posekit.mesh.atlas import Part
-from posekit.mesh.formats import colours_8bit, ply_colours, ply_faces, put_right
+from posekit.mesh.formats import colours_8bit, corrected, ply_colours, ply_faces
 from posekit.mesh.processing import checked_mesh
 
 log = logging.getLogger("posekit")
@@ -117,7 +117,7 @@ def read_parts(path: Path) -> list[Part]:
     assets = _Assets(path)
     try:
         loaded = trimesh.load(
-            io.BytesIO(put_right(kind, data, path.name, assets.get)),
+            io.BytesIO(corrected(kind, data, path.name, assets.get)),
             file_type=kind[1:],
             resolver=assets,
             process=False,
@@ -128,7 +128,7 @@ def read_parts(path: Path) -> list[Part]:
         parts = [] if problem else _parts(scene, path.name)
     except MeshError:
         raise
-    except Exception as error:  # trimesh raises whatever its parsers stumble over
+    except Exception as error:  # trimesh's parsers raise many kinds of errors
         problem = assets.problem or f"cannot be read as {kind[1:].upper()} ({type(error).__name__}: {error})"
         raise MeshError(f"{path.name} {problem}. Export it again.") from error
     if problem:
@@ -158,7 +158,7 @@ def _too_many_pixels(image: Image.Image) -> str | None:
 
 
 def _reading_options(path: Path, data: bytes) -> dict[str, Any]:
-    """What trimesh has to be told about a file's contents."""
+    """Options for trimesh that depend on a file's contents."""
     kind = path.suffix.lower()
     if kind == ".ply":
         # texture coordinates at a face's corners need vertices split; at vertices they must stay as they are

@@ -54,6 +54,7 @@ class Symmetries:
 
     @classmethod
     def none(cls) -> Symmetries:
+        """Of an object that has no symmetry."""
         return cls()
 
     @classmethod
@@ -149,7 +150,7 @@ def _turn_about(R: Floats, point: Floats) -> Pose:
 def _group(turns: Sequence[Floats], text: str) -> list[Floats]:
     """All products of rotations (3, 3), without the identity."""
     found = [np.eye(3)]
-    for known in found:  # grows while it is walked through
+    for known in found:  # grows during the loop
         for turn in turns:
             product = turn @ known
             if np.abs(np.stack(found) - product).max(axis=(1, 2)).min() > 1e-6:

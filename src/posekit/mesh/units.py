@@ -10,12 +10,12 @@ log = logging.getLogger("posekit")
 
 UNITS = {"mm": 0.001, "cm": 0.01, "m": 1.0, "in": 0.0254}
 
-_METRES_BELOW, _MM_ABOVE = 3.0, 20.0  # diameters in a file's own units; between them nobody can tell
+_METRES_BELOW, _MM_ABOVE = 3.0, 20.0  # diameters in a file's own units; between them it cannot be decided
 _SMALLEST, _LARGEST = 0.001, 10.0  # diameters in metres that are an object's
 
 
 def chosen_units(label: str, diameter: float, units: str) -> str:
-    """One of UNITS. Raises MeshError where nobody can tell, or where the size is no object's."""
+    """One of UNITS. Raises MeshError where it cannot be decided, or where the size is no object's."""
     if units == "auto":
         if _METRES_BELOW <= diameter <= _MM_ABOVE:
             could_be = "; ".join(f"{unit}: {plain_length(diameter * UNITS[unit])} long" for unit in UNITS)

@@ -1,1 +1,1 @@
-"""The pose networks. They know tensors only: neither the renderer nor files of pictures."""
+"""The pose networks. They take and give tensors only, and use neither the renderer nor files."""

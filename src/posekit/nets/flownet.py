@@ -42,6 +42,7 @@ class FlowNetEncoder(nn.Module):
                 nn.init.zeros_(module.bias)
 
     def forward(self, x: Tensor) -> Tensor:
+        """(B, in_channels, H, W) -> (B, out_channels, H/64, W/64), sizes rounded up."""
         for name, *_ in LAYERS:
             x = nn.functional.leaky_relu(self.get_submodule(name)(x), 0.1)
         return x

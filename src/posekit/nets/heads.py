@@ -1,4 +1,4 @@
-"""The paper's output layers, shared by both presets, and what a network answers."""
+"""The paper's output layers, shared by both presets, and a network's outputs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What SV-Net (or MV-Net) says about B pairs.
+    """The output of SV-Net (or MV-Net) for B pairs.
 
     quat_wxyz: (B, 4), not normalised. v: (B, 3), as in PoseDelta. angle: (B,), radians, unbounded, None
     for MV-Net.
@@ -42,7 +42,7 @@ def compress_angle(angle: Tensor) -> Tensor:
 
 
 def expand_angle(value: Tensor) -> Tensor:
-    """The inverse of ``compress_angle``, for any answer of a head: below zero for negative ones, so that a loss on it
+    """The inverse of ``compress_angle``, for any output of a head: below zero for negative ones, so that a loss on it
     has a gradient everywhere (up to 14 radians). Bound it to [0, pi] where it is used."""
     return torch.expm1(value.clamp(max=6.0)) * ANGLE_KNEE
 
@@ -50,7 +50,7 @@ def expand_angle(value: Tensor) -> Tensor:
 class PoseHeads(nn.Module):
     """Rotation (4), translation (3) and, for SV-Net, angle (1), each one fully connected layer.
 
-    The layers answer in normalised units; buffers hold the mean and the standard deviation measured
+    The layers' outputs are in normalised units; buffers hold the mean and the standard deviation measured
     over the training pairs (paper, section 3.2). The translation starts at zero and the quaternion
     near the identity, as in DeepIM.
     """

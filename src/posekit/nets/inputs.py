@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from posekit.view import View
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 def to_input(image: NDArray[np.uint8], mask: NDArray[np.bool_] | None) -> NDArray[np.float32]:
@@ -36,6 +39,8 @@ def relief(rendered: View) -> NDArray[np.float32]:
 
 def images_to_tensor(rgbm: Tensor) -> Tensor:
     """uint8 (B, H, W, 3 or 4), alpha = mask (0 or 255) -> float32 (B, 3 or 4, H, W) as ``to_input`` gives it."""
+    import torch
+
     x = rgbm.permute(0, 3, 1, 2).float().div(255.0)
     x[:, :3] -= 0.5
     return x.contiguous(memory_format=torch.channels_last)

@@ -1,7 +1,7 @@
 """The preset that a laptop runs: a shared tower, exchange between both crops, matching, a dense head.
 
 A shared tower describes the observed and the rendered crop, another one the two laid over each other, with the rendered
-mask, normals and relief. No mask of the observed object is an input: its visible and its whole silhouette are answers.
+mask, normals and relief. No mask of the observed object is an input: its visible and its whole silhouette are outputs.
 Exchange blocks (bottleneck convolutions within a crop, attention across the two) tell every cell of one what the other
 shows. Matching all pairs of cells, with the further choice that a cell is not shown, gives a first flow (GMFlow's way:
 Xu et al., 2022) and that a rigid motion; where this motion says that both crops show the same, a head at 1/4
@@ -18,55 +18,23 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from posekit.errors import ConfigError
+from posekit.nets.config import CELL, LiteConfig
 from posekit.nets.heads import PoseHeads, Prediction, expand_angle
 from posekit.nets.rigid import Motion, Surface, induced_flow, solve_motion
 
-CELL = 8  # pixels per cell
 ANCHOR = 4  # pixels per anchor of the dense head; the first anchor is pixel (2, 2)
 FACTS = 9  # see `facts_of`
 PAIR = 11  # channels that the tower over both crops sees: two RGB pictures, mask, normals, relief
 
-_MOST_CHANNELS, _MOST_BLOCKS = 4096, 64
-
-
-@dataclass(frozen=True)
-class LiteConfig:
-    """The size of the lite network."""
-
-    size: tuple[int, int] = (128, 96)  # (width, height) of the crop in pixels, multiples of 8
-    widths: tuple[int, int] = (64, 192)  # channels at 1/4 and 1/8
-    heads: int = 1  # of the attention across
-    blocks: int = 6  # exchanges
-    bottleneck: int = 96  # channels of their 3x3 convolutions
-    fine: int = 48  # channels of the dense head
-
-    def __post_init__(self) -> None:
-        """Raises ConfigError where no network can be made of it."""
-        numbers = (*self.size, *self.widths, self.heads, self.blocks, self.bottleneck, self.fine)
-        if len(self.size) != 2 or len(self.widths) != 2 or any(type(n) is not int for n in numbers):
-            raise ConfigError(f"lite: size and widths are pairs of whole numbers, the rest whole numbers, not {self}.")
-        if min(numbers) < 1 or max(numbers) > _MOST_CHANNELS or self.blocks > _MOST_BLOCKS:
-            raise ConfigError(
-                f"lite: its numbers are from 1 to {_MOST_CHANNELS}, blocks at most {_MOST_BLOCKS}, not {self}."
-            )
-        if any(side % CELL for side in self.size) or self.widths[1] % self.heads:
-            raise ConfigError(
-                f"lite: size {self.size} is in multiples of {CELL} pixels, and heads {self.heads} divide the "
-                f"{self.widths[1]} channels at 1/8."
-            )
-
-    @property
-    def cells(self) -> tuple[int, int]:
-        """(rows, columns) at 1/8."""
-        return self.size[1] // CELL, self.size[0] // CELL
-
 
 def conv_bn(cin: int, cout: int, kernel: int = 3, stride: int = 1) -> nn.Sequential:
+    """A convolution that keeps the size but for its stride, and batch normalisation."""
     return nn.Sequential(nn.Conv2d(cin, cout, kernel, stride, kernel // 2, bias=False), nn.BatchNorm2d(cout))
 
 
 class Residual(nn.Module):
+    """Two 3x3 convolutions and a shortcut: (B, cin, H, W) -> (B, cout, H / stride, W / stride)."""
+
     def __init__(self, cin: int, cout: int, stride: int = 1) -> None:
         super().__init__()
         self.first = conv_bn(cin, cout, 3, stride)
@@ -74,6 +42,7 @@ class Residual(nn.Module):
         self.skip = nn.Identity() if stride == 1 and cin == cout else conv_bn(cin, cout, 1, stride)
 
     def forward(self, x: Tensor) -> Tensor:
+        """(B, cin, H, W) -> (B, cout, H / stride, W / stride), not negative."""
         return F.relu(self.second(F.relu(self.first(x))) + self.skip(x))
 
 
@@ -88,6 +57,7 @@ class Tower(nn.Module):
         self.coarse = Residual(fine, coarse, 2)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """(B, C, H, W) -> features at 1/4 and at 1/8 of the size."""
         x = F.pixel_unshuffle(x, 4).contiguous(memory_format=torch.channels_last)
         fine = self.fine(F.relu(self.stem(x)))
         return fine, self.coarse(fine)
@@ -204,7 +174,7 @@ def similarity_of(rendered: Tensor, observed: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class LiteOutput:
-    """All that the lite losses look at. flows: (B, 2, h, w) in pixels on cells, coarse to fine.
+    """All that the lite losses need. flows: (B, 2, h, w) in pixels on cells, coarse to fine.
     rigid: (B, 2, h, w) in pixels on anchors, what the motions solved from the coarse and the fine flow induce.
     compressed_angle: (B,). similarities: (B, h * w, h * w + 1), logits of which observed cell each rendered one is, the
     last of them none, before and after the exchange."""
@@ -307,7 +277,7 @@ class LiteSVNet(nn.Module):
 
 
 def facts_of(motion: Motion, on: Tensor, log_scale: Tensor, visibility: Tensor) -> Tensor:
-    """What the dense answer says as a whole, (B, FACTS), of the size of 1: the motion's turn (axis times sine, cosine)
+    """A summary of the dense output, (B, FACTS), of the size of 1: the motion's turn (axis times sine, cosine)
     and shift, and over the object the mean log scale and visibility."""
     R, t = motion.R, motion.t
     turn = torch.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], dim=1)
@@ -330,12 +300,12 @@ def with_none(similarity: Tensor, none: Tensor) -> Tensor:
 def soft_flow(similarity: Tensor, cells: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """The mean place that the softmax over each rendered cell's similarities (B, h * w, h * w + 1) gives, as flow
     (B, 2, h, w) in pixels; and (B, 2, h, w), the largest share of one place and the share of none."""
-    home = _grid(*cells, similarity)
+    grid = _grid(*cells, similarity)
     share = torch.softmax(similarity[:, :, :-1], dim=2)
-    place = torch.einsum("bnm,cm->bcn", share, home[0].flatten(1))
+    place = torch.einsum("bnm,cm->bcn", share, grid[0].flatten(1))
     none = torch.sigmoid(similarity[:, :, -1] - torch.logsumexp(similarity[:, :, :-1], dim=2))
     found = torch.stack([share.amax(2), none], dim=1).unflatten(2, cells)
-    return (place.unflatten(2, cells) - home) * CELL, found
+    return (place.unflatten(2, cells) - grid) * CELL, found
 
 
 def normals_of(relief: Tensor, mask: Tensor) -> Tensor:

@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from posekit.nets.config import CELL
 from posekit.nets.heads import PoseHeads, Prediction, compress_angle
-from posekit.nets.lite import CELL, LiteOutput
+from posekit.nets.lite import LiteOutput
 
 
 def paper_pose_loss(prediction: Prediction, heads: PoseHeads, quat_wxyz: Tensor, v: Tensor) -> Tensor:
@@ -79,7 +80,7 @@ class Target:
 def dense_loss(
     output: LiteOutput, heads: PoseHeads, target: Target, config: DenseLossConfig = DenseLossConfig()
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """The lite preset's loss and its parts, detached. Lost pairs teach angle, score and silhouettes only."""
+    """The lite preset's loss and its parts, detached. Lost pairs count for angle, score and silhouettes only."""
     prediction, flows = output.prediction, output.flows
     assert prediction.flow is not None and prediction.log_scale is not None and prediction.visibility is not None
     near = (target.flow.abs().amax(1) < config.max_flow_px) & target.valid & ~target.lost[:, None, None]
@@ -93,19 +94,19 @@ def dense_loss(
         sequence = sequence + config.gamma ** (len(flows) - 1 - k) * (error * cells).sum() / total_cells
 
     shown = F.avg_pool2d((near & target.visible)[:, None].float(), 2)[:, 0] > 0.5
-    judged_cells = F.avg_pool2d((target.valid & ~target.lost[:, None, None])[:, None].float(), 2)[:, 0] > 0.5
-    match = matching_loss(output.similarities[-1], flow_cells, shown, judged_cells)
-    early = matching_loss(output.similarities[0], flow_cells, shown, judged_cells)
+    counted_cells = F.avg_pool2d((target.valid & ~target.lost[:, None, None])[:, None].float(), 2)[:, 0] > 0.5
+    match = matching_loss(output.similarities[-1], flow_cells, shown, counted_cells)
+    early = matching_loss(output.similarities[0], flow_cells, shown, counted_cells)
 
     total = weight.sum().clamp_min(1.0)
     error = (prediction.flow - target.flow).abs().sum(1)
     likelihood = ((error * torch.exp(-prediction.log_scale) + 2 * prediction.log_scale) * weight).sum() / total
-    judged = near.float()
-    visibility = F.binary_cross_entropy_with_logits(prediction.visibility, target.visible.float(), judged)
-    visibility = visibility * judged.numel() / judged.sum().clamp_min(1.0)
+    counted = near.float()
+    visibility = F.binary_cross_entropy_with_logits(prediction.visibility, target.visible.float(), counted)
+    visibility = visibility * counted.numel() / counted.sum().clamp_min(1.0)
 
-    judged_rigid = (target.valid & ~target.lost[:, None, None]).float()
-    rigids = [rigid_loss(flow, target.flow, judged_rigid, config.knee_px) for flow in output.rigid]
+    counted_anchors = (target.valid & ~target.lost[:, None, None]).float()
+    rigids = [rigid_loss(flow, target.flow, counted_anchors, config.knee_px) for flow in output.rigid]
     rigid = sum(config.gamma ** (len(rigids) - 1 - k) * value for k, value in enumerate(rigids))
 
     kept = (~target.lost).float()
@@ -147,34 +148,35 @@ def true_score(target: Target, near_px: float) -> Tensor:
     return torch.exp(-mean / near_px)
 
 
-def rigid_loss(flow: Tensor, truth: Tensor, judged: Tensor, knee: float) -> Tensor:
+def rigid_loss(flow: Tensor, truth: Tensor, counted: Tensor, knee: float) -> Tensor:
     """Mean distance in pixels on the whole object, hidden parts too: the pose's own error as the crop shows it.
 
-    flow, truth: (B, 2, h, w). judged: (B, h, w). knee: pixels from where the distance counts by its logarithm, so that
-    a solver gone astray does not drown the rest.
+    flow, truth: (B, 2, h, w). counted: (B, h, w). knee: pixels from where the distance counts by its logarithm, so
+    that a solver that diverged does not dominate.
     """
     error = (flow - truth.nan_to_num()).pow(2).sum(1).add(1e-6).sqrt()
-    return (knee * torch.log1p(error / knee) * judged).sum() / judged.sum().clamp_min(1.0)
+    return (knee * torch.log1p(error / knee) * counted).sum() / counted.sum().clamp_min(1.0)
 
 
-def matching_loss(similarity: Tensor, flow: Tensor, shown: Tensor, judged: Tensor) -> Tensor:
+def matching_loss(similarity: Tensor, flow: Tensor, shown: Tensor, counted: Tensor) -> Tensor:
     """Cross-entropy of the cell that each rendered cell lies on in the observed crop, or of none.
 
-    similarity: (B, h * w, h * w + 1), logits. flow: (B, 2, h, w), the truth in pixels. shown, judged: (B, h, w) bool;
-    of the judged cells those that are not shown, or lie beside the crop, are none. A place between cells counts for its
-    four neighbours, bilinearly; without this loss the features learn to match several times more slowly (docs/log.md).
+    similarity: (B, h * w, h * w + 1), logits. flow: (B, 2, h, w), the truth in pixels. shown, counted: (B, h, w) bool;
+    of the counted cells those that are not shown, or lie beside the crop, are none. A place between cells counts for
+    its four neighbours, bilinearly; without this loss the features learn to match several times more slowly
+    (docs/log.md).
     """
     B, _, h, w = flow.shape
     ys, xs = torch.meshgrid(*(torch.arange(n, device=flow.device) for n in (h, w)), indexing="ij")
     x, y = xs + flow[:, 0] / CELL, ys + flow[:, 1] / CELL
-    inside = shown & judged & (x >= 0) & (x <= w - 1) & (y >= 0) & (y <= h - 1)
+    inside = shown & counted & (x >= 0) & (x <= w - 1) & (y >= 0) & (y <= h - 1)
     x, y = x.clamp(0, w - 1.001), y.clamp(0, h - 1.001)
     x0, y0 = x.floor(), y.floor()
     fx, fy = x - x0, y - y0
     first = (y0 * w + x0).long()
     logits = torch.log_softmax(similarity, dim=2).view(B, h, w, h * w + 1)
-    total = -(logits[..., -1] * (judged & ~inside)).sum()
+    total = -(logits[..., -1] * (counted & ~inside)).sum()
     for dy, dx, share in ((0, 0, (1 - fx) * (1 - fy)), (0, 1, fx * (1 - fy)), (1, 0, (1 - fx) * fy), (1, 1, fx * fy)):
         found = logits.gather(3, (first + dy * w + dx).unsqueeze(3)).squeeze(3)
         total = total - (found * share * inside).sum()
-    return total / judged.sum().clamp_min(1)
+    return total / counted.sum().clamp_min(1)

@@ -27,10 +27,12 @@ class MatchingConfig(Protocol):
     """What MV-Net needs to know of the tower: widths, its channels at 1/4 and 1/8; size, (width, height) of crops."""
 
     @property
-    def widths(self) -> tuple[int, int]: ...
+    def widths(self) -> tuple[int, int]:
+        """The tower's channels at 1/4 and 1/8."""
 
     @property
-    def size(self) -> tuple[int, int]: ...
+    def size(self) -> tuple[int, int]:
+        """(width, height) of crops, pixels."""
 
 
 class Encoded(NamedTuple):
@@ -133,7 +135,7 @@ class Across(nn.Module):
 
 
 class Block(nn.Module):
-    """The crop's cells and the views' learn of each other."""
+    """Attention between the crop's cells and the views'."""
 
     def __init__(self, channels: int, heads: int, inner: int) -> None:
         super().__init__()
@@ -149,7 +151,7 @@ class Block(nn.Module):
 
 
 class Code(nn.Module):
-    """What is compared to choose views: (N, D, h, w) -> a unit vector (N, 128) that knows the layout roughly."""
+    """What is compared to choose views: (N, D, h, w) -> a unit vector (N, 128) that keeps the rough layout."""
 
     def __init__(self, channels: int, cells: tuple[int, int]) -> None:
         super().__init__()
@@ -158,6 +160,7 @@ class Code(nn.Module):
         self.fc = nn.Linear(48 * rows * columns, 128)
 
     def forward(self, x: Tensor) -> Tensor:
+        """(N, D, h, w) -> (N, 128), unit length, float32."""
         return F.normalize(self.fc(self.reduce(x).flatten(1)).float(), dim=1)
 
 
@@ -178,7 +181,7 @@ class Silhouettes(nn.Module):
 
 class MatchingMVNet(nn.Module):
     """See the module's text. tower: (B, 3, H, W), RGB in [-0.5, 0.5] -> features at 1/4 and 1/8, config.widths wide.
-    views: directions. kept: views that are looked at closely. channels: of the tokens. part: of the codes of cells."""
+    views: directions. kept: views that are compared in full. channels: of the tokens. part: of the codes of cells."""
 
     def __init__(self, tower: nn.Module, config: MatchingConfig, views: int = 42, kept: int = 8, *,
                  channels: int = 128, heads: int = 4, blocks: int = 3, inner: int = 64,

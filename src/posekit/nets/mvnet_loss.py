@@ -26,7 +26,7 @@ class MVLossConfig:
     score: float = 0.5
     turn: float = 1.0
     presence: float = 0.5
-    reach: float = 0.5  # cosine of the largest angle between two directions of view for which the turn is asked
+    reach: float = 0.5  # cosine of the largest angle between two directions of view for which the turn counts
 
 
 def mvnet_loss(

@@ -1,100 +1,121 @@
 """SV-Net of the lite preset through OpenVINO: the same answers as PyTorch's, faster on a CPU.
 
-The converted network is kept in the user's cache (XDG_CACHE_HOME), by the weights' digest: converting takes seconds.
+The converted network is kept in the user's cache (XDG_CACHE_HOME), by the weights' digest: converting takes seconds and
+PyTorch, running what was converted does not.
 """
 
 from __future__ import annotations
 
-import os
 import shutil
 import tempfile
 import warnings
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import openvino
-import torch
-from torch import Tensor, nn
 
 from posekit._version import __version__
-from posekit.errors import ConfigError
+from posekit.io.files import user_cache
 from posekit.nets.inputs import relief, to_input
-from posekit.nets.lite import LiteSVNet
-from posekit.nets.precision import has_fast_bfloat16
-from posekit.nets.predictor import PairPrediction, answers, unpack
-from posekit.nets.weights import Networks
+from posekit.nets.precision import usable_cores
+from posekit.nets.predictor import PairPrediction, unpack
 from posekit.view import View
+
+if TYPE_CHECKING:
+    from posekit.nets.lite import LiteSVNet
 
 
 class OpenVinoPredictor:
-    """As NetworkPredictor, one pair after the other: for a tracker, which has one at a time.
+    """SV-Net through OpenVINO, on the processor.
 
-    bfloat16: whether to compute in it; None = where the processor does so faster. threads: None = OpenVINO's choice.
-    Not thread-safe. Raises ConfigError for networks of another preset than lite.
+    svnet: gives PyTorch's network, where it has to be converted; digest: of its weights, by which the converted one is
+    kept ("untrained": it is not kept). size: (width, height) of its crops. bfloat16: whether to compute in it. threads:
+    of the processor, None = all of this process. streams: pairs that are compared at the same time.
+    Not thread-safe.
     """
 
-    def __init__(self, networks: Networks, bfloat16: bool | None = None, threads: int | None = None) -> None:
-        if not isinstance(networks.svnet, LiteSVNet):
-            raise ConfigError(
-                f"OpenVINO runs the networks of preset lite, not {networks.preset}: leave --runtime torch."
-            )
-        self.networks = networks
-        self.bfloat16 = has_fast_bfloat16("cpu") if bfloat16 is None else bfloat16
-        self.size, self.dense = networks.size, networks.dense
+    dense = True
+
+    def __init__(
+        self,
+        svnet: Callable[[], LiteSVNet],
+        digest: str,
+        size: tuple[int, int],
+        *,
+        bfloat16: bool = False,
+        threads: int | None = None,
+        streams: int = 1,
+    ) -> None:
+        self.size, self.bfloat16 = size, bfloat16
         options: dict[str, Any] = {
-            "INFERENCE_PRECISION_HINT": "bf16" if self.bfloat16 else "f32",
-            "PERFORMANCE_HINT": "LATENCY",
+            "INFERENCE_PRECISION_HINT": "bf16" if bfloat16 else "f32",
+            "INFERENCE_NUM_THREADS": threads or usable_cores(),
+            "NUM_STREAMS": str(streams),
         }
-        if threads is not None:
-            options["INFERENCE_NUM_THREADS"] = threads
-        self._run = openvino.Core().compile_model(_converted(networks), "CPU", options)
+        if digest != "untrained":  # what is compiled for this processor is kept, too
+            options["CACHE_DIR"] = str(user_cache("openvino") / "compiled")
+        compiled = openvino.Core().compile_model(_converted(svnet, digest), "CPU", options)
+        self._queue = openvino.AsyncInferQueue(compiled, streams)
+        self._queue.set_callback(self._done)
+        self._answers: dict[int, list[Any]] = {}
 
     def predict(self, observed: Sequence[View], rendered: Sequence[View]) -> list[PairPrediction]:
-        return [self._one(o, r) for o, r in zip(observed, rendered, strict=True)]
+        """As `Predictor.predict`."""
+        for k, (o, r) in enumerate(zip(observed, rendered, strict=True)):
+            focal = np.array([r.camera.fx / r.camera.width], np.float32)
+            first, second = to_input(o.image, None)[None, :3], to_input(r.image, r.mask)[None]
+            self._queue.start_async([first, second, relief(r)[None], focal], k)
+        self._queue.wait_all()
+        return [unpack(self._answers.pop(k), 0, drawn) for k, drawn in enumerate(rendered)]
 
-    def _one(self, observed: View, rendered: View) -> PairPrediction:
-        first, second = to_input(observed.image, None)[None, :3], to_input(rendered.image, rendered.mask)[None]
-        focal = np.array([rendered.camera.fx / rendered.camera.width], np.float32)
-        return unpack(list(self._run([first, second, relief(rendered)[None], focal]).values()), 0, rendered)
-
-
-class _Answers(nn.Module):
-    """The network with its answers in the order that `unpack` takes them."""
-
-    def __init__(self, svnet: LiteSVNet) -> None:
-        super().__init__()
-        self.svnet = svnet
-
-    def forward(self, observed: Tensor, rendered: Tensor, relief: Tensor, focal: Tensor) -> tuple[Tensor, ...]:
-        return answers(self.svnet(observed, rendered, relief, focal))  # type: ignore[return-value]
+    def _done(self, request: Any, k: int) -> None:
+        self._answers[k] = [np.array(output.data) for output in request.output_tensors]
 
 
-def _converted(networks: Networks) -> Any:
-    """From the cache, else from PyTorch's module; what has no digest (untrained networks) is not kept."""
-    kept = (
-        _cache() / f"{networks.digest}-{__version__}-{openvino.__version__.split('-')[0]}" if networks.digest else None
-    )
-    if kept is not None and kept.is_dir():
-        return openvino.Core().read_model(kept / "svnet.xml")
-    assert isinstance(networks.svnet, LiteSVNet)
-    model = _convert(networks.svnet)
-    if kept is not None:
-        with suppress(OSError):  # a cache that cannot be written costs time only
+def has_bfloat16() -> bool:
+    """Whether OpenVINO computes in bfloat16 on this processor: with AVX-512's or AMX's instructions for it."""
+    return "BF16" in openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
+
+
+def _converted(svnet: Callable[[], LiteSVNet], digest: str) -> Any:
+    """From the cache, else from PyTorch's network; an untrained one is not kept."""
+    kept = user_cache("openvino") / f"{digest}-{__version__}-{openvino.__version__.split('-')[0]}"
+    if digest == "untrained":
+        return _convert(svnet())
+    if not (kept / "svnet.xml").is_file():
+        model = _convert(svnet())
+        try:
             _keep(model, kept)
-    return model
+        except OSError:  # a cache that cannot be written costs time only
+            return model
+    return openvino.Core().read_model(kept / "svnet.xml")  # the first time too: its rounding differs a little
 
 
 def _convert(svnet: LiteSVNet) -> Any:
+    import torch
+    from torch import Tensor, nn
+
+    from posekit.nets.pytorch import answers
+
+    class Answers(nn.Module):
+        """The network with its answers in the order that `unpack` takes them."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.svnet = svnet
+
+        def forward(self, observed: Tensor, rendered: Tensor, depths: Tensor, focal: Tensor) -> tuple[Tensor, ...]:
+            return answers(self.svnet(observed, rendered, depths, focal))  # type: ignore[return-value]
+
     width, height = svnet.config.size
     rendered = torch.zeros(1, 4, height, width)
     rendered[:, 3, height // 4 : -height // 4, width // 4 : -width // 4] = 1.0
     example = (rendered[:, :3], rendered, torch.zeros(1, height, width), torch.ones(1))
     with torch.inference_mode(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of sizes that become constants: a crop's size is one
-        traced = torch.jit.trace(_Answers(svnet).eval(), example, check_trace=False)
+        traced = torch.jit.trace(Answers().eval(), example, check_trace=False)
     return openvino.convert_model(traced, example_input=example, input=[list(x.shape) for x in example])
 
 
@@ -107,8 +128,3 @@ def _keep(model: Any, folder: Path) -> None:
         part.rename(folder)
     finally:
         shutil.rmtree(part, ignore_errors=True)
-
-
-def _cache() -> Path:
-    root = os.environ.get("XDG_CACHE_HOME")
-    return (Path(root) if root else Path.home() / ".cache") / "posekit" / "openvino"

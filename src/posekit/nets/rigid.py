@@ -18,10 +18,10 @@ DAMPING = 1e-2  # of the normal equations' diagonal
 @dataclass(frozen=True, eq=False)
 class Surface:
     """The rendered surface at N anchors in B crops. points: (B, N, 3), along the view's axes, mean depth 1.
-    home: (B, N, 2), where they are drawn, in pixels from the principal point. focal: (B,), pixels."""
+    anchors: (B, N, 2), where they are drawn, in pixels from the principal point. focal: (B,), pixels."""
 
     points: Tensor
-    home: Tensor
+    anchors: Tensor
     focal: Tensor
 
     @classmethod
@@ -30,10 +30,10 @@ class Surface:
         B, h, w = relief.shape
         ys, xs = torch.meshgrid(*(torch.arange(n, device=relief.device) for n in (h, w)), indexing="ij")
         x, y = xs * step + first - 0.5 * (w * step - 1), ys * step + first - 0.5 * (h * step - 1)
-        home = torch.stack([x, y], dim=-1).view(1, h * w, 2).expand(B, -1, -1)
+        anchors = torch.stack([x, y], dim=-1).view(1, h * w, 2).expand(B, -1, -1)
         depth = (1 + relief / focal[:, None, None]).view(B, h * w, 1)
         pixels = focal * w * step
-        return cls(torch.cat([home / pixels[:, None, None] * depth, depth], dim=2), home, pixels)
+        return cls(torch.cat([anchors / pixels[:, None, None] * depth, depth], dim=2), anchors, pixels)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +45,7 @@ class Motion:
 
     @classmethod
     def none(cls, like: Tensor) -> Motion:
+        """The identity for each of a batch; like: (B, ...), whose device it takes."""
         B = like.shape[0]
         return cls(torch.eye(3, device=like.device).expand(B, 3, 3), torch.zeros(B, 3, device=like.device))
 
@@ -59,7 +60,7 @@ def moved(surface: Surface, motion: Motion) -> tuple[Tensor, Tensor]:
 def induced_flow(surface: Surface, motion: Motion) -> Tensor:
     """Where the motion takes the anchors, (B, N, 2) in pixels."""
     _, p = moved(surface, motion)
-    return p[..., :2] / p[..., 2:].clamp_min(0.1) * surface.focal[:, None, None] - surface.home
+    return p[..., :2] / p[..., 2:].clamp_min(0.1) * surface.focal[:, None, None] - surface.anchors
 
 
 def solve_motion(surface: Surface, flow: Tensor, weight: Tensor, steps: int = 3) -> Motion:
@@ -80,7 +81,7 @@ def _step(surface: Surface, motion: Motion, flow: Tensor, weight: Tensor) -> Mot
     B, N = weight.shape
     z = p[..., 2].clamp_min(0.1)
     f = surface.focal[:, None] / z
-    residual = surface.home + flow - p[..., :2] * f[..., None]
+    residual = surface.anchors + flow - p[..., :2] * f[..., None]
     zero = torch.zeros_like(z)
     to_t = torch.stack([f, zero, -f * p[..., 0] / z, zero, f, -f * p[..., 1] / z], dim=-1).view(B, N, 2, 3)
     # d(p)/d(turn) = -[arm]x, row by row of the projection

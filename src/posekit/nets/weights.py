@@ -1,10 +1,9 @@
-"""Weights on disk: ``NAME.safetensors`` (fp16) beside ``NAME.toml`` (preset, training, measured figures). No pickle."""
+"""The networks, made and loaded with PyTorch: see `posekit.nets.config` for their files."""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,32 +16,13 @@ from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from posekit.errors import ConfigError, WeightsError
-from posekit.io.files import other_content, write_bytes_atomic, write_text_atomic
-from posekit.nets.lite import LiteConfig, LiteSVNet
+from posekit.io.files import write_bytes_atomic, write_text_atomic
+from posekit.nets.config import PRESETS, LiteConfig, PaperConfig, WeightsFile
+from posekit.nets.lite import LiteSVNet
 from posekit.nets.mvnet import MatchingMVNet
 from posekit.nets.paper import Branch, PaperMVNet, PaperSVNet
 
-PRESETS = ("lite", "paper")
 SHARED = ("branch.", "tower.")  # what MV-Net has from SV-Net
-_LONGEST_SIDE, _WIDEST = 4096, 16
-SHIPPED = Path(__file__).resolve().parent.parent / "weights"
-
-
-@dataclass(frozen=True)
-class PaperConfig:
-    """The size of the paper's networks."""
-
-    size: tuple[int, int] = (640, 480)  # (width, height) of the crop;
-    width: float = 1.0  # share of FlowNetS's channels;
-    views: int = 6  # MV-Net's
-
-    def __post_init__(self) -> None:
-        """Raises ConfigError where no network can be made of it."""
-        numbers = (*self.size, self.views)
-        if len(self.size) != 2 or any(type(n) is not int or not 1 <= n <= _LONGEST_SIDE for n in numbers):
-            raise ConfigError(f"paper: size and views are whole numbers from 1 to {_LONGEST_SIDE}, not {self}.")
-        if isinstance(self.width, bool) or not 0 < self.width <= _WIDEST:
-            raise ConfigError(f"paper: width is above 0 and at most {_WIDEST}, not {self.width}.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +38,7 @@ class Networks:
 
     @property
     def size(self) -> tuple[int, int]:
+        """(width, height) of the crops that the networks take, pixels."""
         return self.config.size
 
     @property
@@ -110,45 +91,15 @@ def _half(value: Tensor) -> Tensor:
     return value.detach().half().contiguous() if value.is_floating_point() else value.detach().contiguous()
 
 
-def find_weights(preset: str, path: Path | None = None) -> Path:
-    """The ``.safetensors`` file: ``path`` (the file, its stem or its folder), else the one shipped for the preset.
-
-    Raises WeightsError where there is none.
-    """
-    if path is None:
-        found = SHIPPED / f"{preset}.safetensors"
-        if not found.is_file():
-            raise WeightsError(
-                f"posekit ships no trained weights for preset {preset!r}. Pass --weights FILE, or use --preset lite."
-            )
-        return found
-    candidates = [path, path.with_suffix(".safetensors"), path / f"{preset}.safetensors"]
-    for candidate in candidates:
-        if candidate.is_file():
-            return candidate.with_suffix(".safetensors")
-    raise WeightsError(f"no weights at {path}: expected a .safetensors file with its .toml beside it.")
-
-
 def load_networks(preset: str, path: Path | None = None) -> Networks:
     """Read weights strictly. Raises WeightsError where a file is missing, damaged or of another preset."""
-    file = find_weights(preset, path)
-    about_file = file.with_suffix(".toml")
+    about = WeightsFile.read(preset, path)
+    file = about.path
     try:
-        head = tomllib.loads(about_file.read_text())
-        data = file.read_bytes()
         state = load_file(file)
-    except FileNotFoundError as error:
-        raise WeightsError(f"{file.name} needs {about_file.name} beside it: {error}") from error
-    except (OSError, ValueError, RecursionError, SafetensorError) as error:
-        if file.is_file() and (content := other_content(file.read_bytes())) is not None:
-            raise WeightsError(f"{file} {content}.") from error
+    except (OSError, ValueError, SafetensorError) as error:
         raise WeightsError(f"the weights {file} are damaged: {error}. Fetch or train them anew.") from error
-    if head.get("preset") != preset:
-        raise WeightsError(f"{file} holds weights of preset {head.get('preset')!r}, not {preset!r}.")
-    digest = hashlib.sha256(data).hexdigest()[:16]
-    if digest != head.get("sha256_16"):
-        raise WeightsError(f"{file} and {about_file.name} do not belong together (hash {digest}). Fetch them anew.")
-    networks = _built(preset, head.get("config", {}), state, file)
+    networks = _built(preset, about.config, state, file)
     has_mvnet = any(k.startswith("mvnet.") for k in state)
     _load_strictly(networks.svnet, {k[6:]: v for k, v in state.items() if k.startswith("svnet.")}, file)
     if networks.mvnet is not None and has_mvnet:
@@ -159,17 +110,17 @@ def load_networks(preset: str, path: Path | None = None) -> Networks:
     mvnet = networks.mvnet if has_mvnet else None
     if mvnet is not None:
         mvnet.eval()
-    return dataclasses.replace(networks, mvnet=mvnet, digest=digest, about=head.get("about", {}))
+    return dataclasses.replace(networks, mvnet=mvnet, digest=about.digest, about=about.about)
 
 
-def _built(preset: str, values: Any, state: Mapping[str, Tensor], file: Path) -> Networks:
+def _built(preset: str, config: LiteConfig | PaperConfig, state: Mapping[str, Tensor], file: Path) -> Networks:
     """The networks of a configuration, without memory for their parameters, which the file's take the place of.
 
     Raises WeightsError where a configuration makes none, or networks with other parameters than the file holds.
     """
     try:
         with torch.device("meta"):
-            networks = build(preset, _config(preset, values))
+            networks = build(preset, config)
         parameters = sum(v.numel() for v in networks.svnet.state_dict().values())
         stored = sum(v.numel() for k, v in state.items() if k.startswith("svnet."))
         if parameters != stored:
@@ -180,16 +131,6 @@ def _built(preset: str, values: Any, state: Mapping[str, Tensor], file: Path) ->
     ) as error:  # fmt: skip
         first = str(error).partition("\n")[0]
         raise WeightsError(f"the configuration of the weights {file} makes no networks ({first}).") from error
-
-
-def _config(preset: str, values: Mapping[str, Any]) -> LiteConfig | PaperConfig:
-    kind: type[LiteConfig | PaperConfig] = LiteConfig if preset == "lite" else PaperConfig
-    known = {f.name for f in dataclasses.fields(kind)}
-    unknown = set(values) - known
-    if unknown:
-        raise WeightsError(f"the weights' configuration has unknown keys {sorted(unknown)}; known: {sorted(known)}.")
-    chosen: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-    return kind(**chosen)
 
 
 def _load_strictly(module: nn.Module, state: dict[str, Tensor], file: Path) -> None:

@@ -194,6 +194,7 @@ class OsMesa:
         self.__enter__()
 
     def load(self, name: str) -> int:
+        """The address of an OpenGL function, 0 where there is none."""
         return int(self._library.OSMesaGetProcAddress(name.encode()) or 0)
 
     load_opengl_function = load
@@ -208,6 +209,7 @@ class OsMesa:
         self._library.OSMesaMakeCurrent(None, None, 0, 0, 0)
 
     def release(self) -> None:
+        """Destroy the context; a second call does nothing."""
         if self._handle:
             self._library.OSMesaDestroyContext(self._handle)
             self._handle = None

@@ -69,6 +69,7 @@ class Program:
         self._uniforms = {name: member for name, member in members.items() if name in Draw.__dataclass_fields__}
 
     def write(self, draw: Draw) -> None:
+        """Set the program's uniforms to a draw call's values."""
         for name, uniform in self._uniforms.items():
             uniform.write(getattr(draw, name))  # type: ignore[union-attr]
 
@@ -98,6 +99,7 @@ class Mesh:
             self._attributes["colour"] = (gl.buffer(padded.tobytes()), "3f1 1x1")
 
     def render(self, gl: moderngl.Context, program: Program) -> None:
+        """Draw all faces with a program into the bound framebuffer."""
         key = program.gl_program.glo
         if key not in self._arrays:
             names = [name for name in self._attributes if name in program.gl_program]

@@ -1,4 +1,5 @@
-"""Meshes that look other than the real object: CAD files have no colours, scans have few, paint and labels differ.
+"""Meshes whose appearance differs from the real object's: CAD files have no colours, scans have few, paint and labels
+differ.
 
 A refiner must not trust the mesh's appearance, so in a part of the training pairs the rendered and the observed side
 show two variants of one mesh.
@@ -18,8 +19,8 @@ from posekit.synth.procedural import random_colour, random_texture
 Image = NDArray[np.uint8]
 Rng = np.random.Generator
 
-FADED = ("plain", "one colour", "washed out", "vertex colours")  # what `faded` makes
-KINDS = (*FADED, "other paint")
+WASHED_OUT = ("plain", "one colour", "washed out", "vertex colours")  # what `washed_out` makes
+KINDS = (*WASHED_OUT, "other paint")
 SHARES = (0.4, 0.12, 0.12, 0.16, 0.2)
 
 
@@ -30,7 +31,7 @@ def variants(
 
     The rendered one is plain grey, of one colour, washed out or has the texture's colours at its vertices only, or the
     observed one has another paint; in a tenth of these cases the two are exchanged. deformed: the share of rendered
-    meshes whose surface strays smoothly by up to 0.5 % of the diameter. photos: to cut textures from.
+    meshes whose surface is deformed smoothly by up to 0.5 % of the diameter. photos: to cut textures from.
     """
     rendered = observed = model
     if rng.random() < share:
@@ -40,13 +41,13 @@ def variants(
             if rng.random() < 0.5:
                 rendered = replace(model, texture=None, uvs=None, colors=None)
         else:
-            rendered = faded(model, kind, rng)
+            rendered = washed_out(model, kind, rng)
             if model.texture is None and model.colors is None:
                 observed = painted(model, photos, rng)
         if rng.random() < 0.1:
             rendered, observed = observed, rendered
     if rng.random() < deformed:
-        rendered = strayed(rendered, rng)
+        rendered = deformed_mesh(rendered, rng)
     return rendered, observed
 
 
@@ -62,7 +63,7 @@ def vertex_colours(model: ObjectModel) -> Image:
     return np.full((len(model.vertices), 3), 153, np.uint8)
 
 
-def faded(model: ObjectModel, kind: str, rng: Rng) -> ObjectModel:
+def washed_out(model: ObjectModel, kind: str, rng: Rng) -> ObjectModel:
     """The mesh with less colour than it has. kind: "plain", "one colour", "washed out" or "vertex colours"."""
     if kind == "plain":
         return replace(model, texture=None, uvs=None, colors=None)
@@ -87,7 +88,7 @@ def painted(model: ObjectModel, photos: Sequence[Image], rng: Rng) -> ObjectMode
     return replace(model, colors=None, uvs=uvs, texture=random_texture(rng, photos))
 
 
-def strayed(model: ObjectModel, rng: Rng) -> ObjectModel:
+def deformed_mesh(model: ObjectModel, rng: Rng) -> ObjectModel:
     """The mesh with its vertices moved by smooth waves of up to 0.5 % of the diameter."""
     points = model.vertices.astype(np.float64) / model.diameter
     waves = np.sin(points @ (rng.normal(size=(3, 3)) * 8.0) + rng.uniform(0, 6, size=3))

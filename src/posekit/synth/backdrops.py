@@ -13,7 +13,7 @@ from posekit.io.load import load_image
 from posekit.synth.procedural import noise_image, random_colour, random_texture
 
 PICTURES = (".jpg", ".jpeg", ".png", ".webp")
-SHELF = 48  # procedural textures of a data set, made once
+TEXTURES = 48  # procedural textures of a data set, made once
 
 Image = NDArray[np.uint8]
 Rng = np.random.Generator
@@ -44,7 +44,7 @@ class Backdrops:
 
     def texture(self, rng: Rng) -> Image:
         """One of the data set's procedural textures."""
-        k = int(rng.integers(SHELF))
+        k = int(rng.integers(TEXTURES))
         if k not in self._textures:
             self._textures[k] = random_texture(np.random.default_rng([self.seed, 1, k]))
         return self._textures[k]
@@ -85,7 +85,7 @@ def _paste(picture: Image, texture: Image, rng: Rng) -> None:
 def photograph(image: Image, rng: Rng) -> Image:
     """Colour jitter, blur and sensor noise of a camera, uint8 (H, W, 3) to the same.
 
-    The colours go through a table for each channel: gain, contrast, gamma and white balance at one look-up.
+    The colours go through a table for each channel: gain, contrast, gamma and white balance in one lookup.
     """
     levels = np.linspace(0, 1, 256)
     gain = np.exp(rng.normal() * 0.18) * np.exp(rng.normal(size=(3, 1)) * 0.06)

@@ -14,7 +14,7 @@ from posekit.mesh.model import ObjectModel
 RATE = 30.0  # frames a second
 MIXED = "mixed"
 BEAT, REST = 0.5, 0.7  # of jerky motion: seconds from rest to rest, the share of them at rest
-TREMBLE_RAD, TREMBLE = 0.02, 0.01  # of jerky motion: standard deviations, the latter in diameters
+JITTER_RAD, JITTER = 0.02, 0.01  # of jerky motion: standard deviations, the latter in diameters
 
 Rng = np.random.Generator
 Path = Callable[[float], Pose]
@@ -22,7 +22,7 @@ Path = Callable[[float], Pose]
 
 @dataclass(frozen=True)
 class Motion:
-    """speed: of the path, 0 = still. jerky: in bursts, with trembling. hidden: something passes in front. leaves: out
+    """speed: of the path, 0 = still. jerky: in bursts, with jitter. hidden: something passes in front. leaves: out
     of the picture and back."""
 
     speed: float = 1.0
@@ -48,7 +48,7 @@ def motion_of(chosen: str, number: int) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class Sway:
+class SineMotion:
     """A smooth motion: a sum of K sines in six directions, zero in the mean. amplitude, frequency, phase: (K, 6),
     the first three of rotation vectors (radians), the others metres; frequencies in turns a second."""
 
@@ -57,7 +57,7 @@ class Sway:
     phase: NDArray[np.float64]
 
     @classmethod
-    def random(cls, rng: Rng, turn: float, shift: float, hertz: tuple[float, float] = (0.05, 0.35)) -> Sway:
+    def random(cls, rng: Rng, turn: float, shift: float, hertz: tuple[float, float] = (0.05, 0.35)) -> SineMotion:
         """turn: radians, shift: metres, standard deviations of the largest displacement. hertz: of the slowest sines;
         the others are twice and three times as fast."""
         scale = np.array([turn] * 3 + [shift] * 3) / np.arange(1, 4)[:, None]
@@ -69,14 +69,17 @@ class Sway:
         return Pose(so3_exp(w[:3]), w[3:])
 
 
-def sway(motion: Motion, rng: Rng, turn: float, shift: float, diameter: float = 0.0) -> Path:
-    """A path about the identity. diameter: metres, of what trembles where the motion is jerky."""
-    smooth, tremble = Sway.random(rng, turn, shift), Sway.random(rng, TREMBLE_RAD, TREMBLE * diameter, (3.0, 4.0))
+def random_motion(motion: Motion, rng: Rng, turn: float, shift: float, diameter: float = 0.0) -> Path:
+    """A path about the identity. diameter: metres, of the object that jitters where the motion is jerky."""
+    smooth, jitter = (
+        SineMotion.random(rng, turn, shift),
+        SineMotion.random(rng, JITTER_RAD, JITTER * diameter, (3.0, 4.0)),
+    )
     if not motion.jerky:
         return lambda seconds: smooth(motion.speed * seconds)
 
     def path(seconds: float) -> Pose:
-        small = tremble(seconds)
+        small = jitter(seconds)
         large = smooth(motion.speed * burst(seconds))
         return Pose(small.R @ large.R, small.t + large.t)
 

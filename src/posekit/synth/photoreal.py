@@ -28,7 +28,6 @@ from posekit.synth.plan import SynthConfig
 from posekit.synth.procedural import noise_image, random_colour
 
 OBJECTS = (3, 8)  # on a table, at most as many as there are
-CPU_VARIANTS = ("llvm_ad_rgb", "scalar_rgb")
 LIBLLVM = (20, 19, 18, 17, 16)  # versions that work; 15 does not
 DEPTH_OF_PATHS = 6
 MI_CAM = np.diag([-1.0, -1.0, 1.0, 1.0])  # Mitsuba's camera looks along z with x left and y up
@@ -157,6 +156,7 @@ class Photoreal:
         self.meshes = {obj_id: _mesh_data(model) for obj_id, model in self.models}
 
     def block(self, number: int, places: Sequence[int]) -> Iterator[tuple[int, Picture]]:
+        """(place, picture) for each place: views of room ``number``, path-traced."""
         room = self._room(np.random.default_rng([self.config.seed, 0, number]))
         scene = self.mi.load_dict(room.scene)
         for place in places:
@@ -175,7 +175,7 @@ class Photoreal:
         for k, (obj_id, _, pose) in enumerate(kept):
             scene[f"object{k}"] = self._mesh(obj_id, pose, rng)
         others = self._surfaces(unit, rng) | self._lights(unit, rng)
-        scene |= {name: self.mi.load_dict(what) for name, what in others.items()}  # from one dict their order is chance
+        scene |= {name: self.mi.load_dict(what) for name, what in others.items()}  # from one dict their order is random
         return Room(kept, unit, scene)
 
     def _mesh(self, obj_id: int, pose: Pose, rng: Rng) -> Any:
@@ -254,7 +254,7 @@ class Photoreal:
 
     def _view(self, scene: Any, room: Room, rng: Rng) -> Picture:
         camera = Camera.from_fov(float(np.deg2rad(rng.uniform(32, 58))), *self.config.size)
-        T_cam_world, distance = _look(room, rng)
+        T_cam_world, distance = _camera_pose(room, rng)
         linear = self._trace(scene, camera, T_cam_world, distance, room.unit, rng)
         image = develop(linear, rng)
         ground = self._depth(scene, camera, T_cam_world)
@@ -288,7 +288,7 @@ class Photoreal:
         })  # fmt: skip
 
     def _depth(self, scene: Any, camera: Camera, T_cam_world: Pose) -> NDArray[np.float32]:
-        """Depth (H, W), metres, at the pixels' centres; 0 where there is only sky. (Without OpenGL: Mitsuba's rays.)"""
+        """Depth (H, W), metres, at the pixels' centres; 0 where there is only sky. (By Mitsuba's rays, not OpenGL.)"""
         mi, T_world_cam = self.mi, T_cam_world.inverse()
         rays = camera.backproject(camera.pixel_grid()).reshape(-1, 3)
         directions = (rays @ T_world_cam.R.T).astype(np.float32)
@@ -372,7 +372,7 @@ def _environments(folder: str) -> list[Path]:
     return found
 
 
-def _look(room: Room, rng: Rng) -> tuple[Pose, float]:
+def _camera_pose(room: Room, rng: Rng) -> tuple[Pose, float]:
     """``T_cam_world`` and the distance of what is in focus: the camera looks at one of the objects, from above."""
     _, model, pose = room.objects[int(rng.integers(len(room.objects)))]
     target = pose.apply(model.center) + rng.normal(size=3) * 0.25 * room.unit

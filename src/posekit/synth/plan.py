@@ -62,6 +62,7 @@ class SynthConfig:
         return 1 + number // per_scene, number % per_scene
 
     def to_json(self) -> str:
+        """The text that `read` reads."""
         return json.dumps(dataclasses.asdict(self), indent=1) + "\n"
 
     @classmethod

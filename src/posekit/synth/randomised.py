@@ -36,6 +36,7 @@ class Randomised:
         self.clutter = Clutter(config.seed)
 
     def block(self, number: int, places: Sequence[int]) -> Iterator[tuple[int, Picture]]:
+        """(place, picture) for each place, from block ``number``'s own random numbers."""
         for place in places:
             yield place, self._picture(number, np.random.default_rng([self.config.seed, 0, number]))
 

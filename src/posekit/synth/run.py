@@ -1,4 +1,4 @@
-"""A data set made by one process, several, or a cluster: begun, gone on with, finished.
+"""A data set made by one process, several, or a cluster: begun, continued, finished.
 
 Image n is a function of the configuration and n, and is written before its record: whoever makes it, in whatever
 order, the data set is the same, and one that was killed goes on with the images that have no record.
@@ -119,7 +119,7 @@ def _jobs(config: SynthConfig, missing: Sequence[int]) -> Iterator[list[int]]:
 def _in_processes(machines: Machines, root: Path, jobs: Sequence[list[int]]) -> Iterator[int]:
     """New processes, not forked: OpenGL does not outlive a fork."""
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(machines.workers, len(jobs)), context, initializer=_calm) as pool:
+    with ProcessPoolExecutor(min(machines.workers, len(jobs)), context, initializer=_single_threaded) as pool:
         futures: set[Future[int]] = {pool.submit(make_images, str(root), job) for job in jobs}
         try:
             while futures:
@@ -158,7 +158,7 @@ def _on_ray(machines: Machines, root: Path, jobs: Sequence[list[int]]) -> Iterat
 
 
 def _on_node(root: str, numbers: list[int]) -> tuple[int, str]:
-    _calm()
+    _single_threaded()
     if not (Path(root) / CONFIG).is_file():
         return 0, f"there is no {root} on its machine; --out must lie on a file system that all machines share."
     try:
@@ -167,7 +167,7 @@ def _on_node(root: str, numbers: list[int]) -> tuple[int, str]:
         return 0, str(error)
 
 
-def _calm() -> None:
+def _single_threaded() -> None:
     """One process of several: no threads of its own."""
     os.environ["LP_NUM_THREADS"] = "0"
     cv2.setNumThreads(0)

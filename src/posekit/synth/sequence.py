@@ -19,7 +19,7 @@ from posekit.render import Light, Renderer
 from posekit.synth.backdrops import Backdrops, add_noise
 from posekit.synth.draw_objects import Drawn, Placed, draw_objects
 from posekit.synth.light import random_light
-from posekit.synth.motion import MOTIONS, RATE, Motion, Path, away_and_back, motion_of, moved, passing, sway
+from posekit.synth.motion import MOTIONS, RATE, Motion, Path, away_and_back, motion_of, moved, passing, random_motion
 from posekit.synth.plan import SynthConfig
 from posekit.synth.randomised import Clutter, random_camera
 
@@ -32,7 +32,7 @@ Rng = np.random.Generator
 
 
 @dataclass(frozen=True, eq=False)
-class Thing:
+class MovingObject:
     """obj_id: None for what is not annotated. T_world_obj: by the seconds."""
 
     obj_id: int | None
@@ -41,12 +41,12 @@ class Thing:
 
 
 @dataclass(frozen=True, eq=False)
-class Take:
-    """A sequence before it is drawn. wide: the backdrop. noise: of the sensor, grey levels."""
+class SequencePlan:
+    """What a sequence shows, before it is drawn. wide: the backdrop. noise: of the sensor, grey levels."""
 
     camera: Camera
     light: Light
-    things: list[Thing]
+    objects: list[MovingObject]
     T_cam_world: Path
     wide: NDArray[np.uint8]
     noise: float
@@ -62,67 +62,70 @@ class Sequences:
         self.clutter = Clutter(config.seed)
 
     def block(self, number: int, places: Sequence[int]) -> Iterator[tuple[int, Picture]]:
-        take = self._take(MOTIONS[motion_of(self.config.motion, number)],
+        """(place, picture) for each place: frames of sequence ``number``."""
+        plan = self._plan(MOTIONS[motion_of(self.config.motion, number)],
                           np.random.default_rng([self.config.seed, 0, number]))  # fmt: skip
         for place in places:
-            drawn = self._frame(take, place / RATE)
+            drawn = self._frame(plan, place / RATE)
             noise = np.random.default_rng([self.config.seed, 1, number, place])
-            image = add_noise(drawn.image, take.noise, noise)
-            yield place, Picture(image, take.camera, drawn.annotations, drawn.depth, take.T_cam_world(place / RATE))
+            image = add_noise(drawn.image, plan.noise, noise)
+            yield place, Picture(image, plan.camera, drawn.annotations, drawn.depth, plan.T_cam_world(place / RATE))
 
-    # --- what happens ---
+    # --- motion ---
 
-    def _take(self, motion: Motion, rng: Rng) -> Take:
+    def _plan(self, motion: Motion, rng: Rng) -> SequencePlan:
         camera, light = random_camera(self.config.size, rng), random_light(rng)
         count = min(len(self.models), int(rng.integers(1, 4)))
         chosen = [self.models[int(k)] for k in rng.choice(len(self.models), size=count, replace=False)]
         starts = [_start(model, camera, rng) for _, model in chosen]
-        things = [Thing(obj_id, model, self._path(motion, start, model, camera, rng))
+        objects = [MovingObject(obj_id, model, self._path(motion, start, model, camera, rng))
                   for (obj_id, model), start in zip(chosen, starts, strict=True)]  # fmt: skip
         first = chosen[0][1]
         for _ in range(int(rng.integers(0, 3))):
             beside = self.clutter.beside(starts[0], first, rng)
-            by = sway(motion, rng, 0.4, 0.4 * first.diameter, beside.model.diameter)
-            things.append(Thing(None, beside.model, moved(beside.T_cam_obj, beside.model, by)))
+            by = random_motion(motion, rng, 0.4, 0.4 * first.diameter, beside.model.diameter)
+            objects.append(MovingObject(None, beside.model, moved(beside.T_cam_obj, beside.model, by)))
         if motion.hidden:
-            things.append(self._passer(starts[0], first, rng))
+            objects.append(self._passing_object(starts[0], first, rng))
         wide = self.backdrops.draw(rng, (round(WIDER * camera.width), round(WIDER * camera.height)))
-        T_cam_world = sway(motion, rng, 0.04, 0.2 * first.diameter, first.diameter)
-        return Take(camera, light, things, T_cam_world, wide, float(rng.uniform(1.0, 5.0)))
+        T_cam_world = random_motion(motion, rng, 0.04, 0.2 * first.diameter, first.diameter)
+        return SequencePlan(camera, light, objects, T_cam_world, wide, float(rng.uniform(1.0, 5.0)))
 
     def _path(self, motion: Motion, start: Pose, model: ObjectModel, camera: Camera, rng: Rng) -> Path:
-        path = moved(start, model, sway(motion, rng, 0.5, 0.3 * model.diameter, model.diameter))
+        path = moved(start, model, random_motion(motion, rng, 0.5, 0.3 * model.diameter, model.diameter))
         if not motion.leaves:
             return path
         return away_and_back(path, model, _outside(start, model, camera, rng), self.config.frames / RATE)
 
-    def _passer(self, start: Pose, model: ObjectModel, rng: Rng) -> Thing:
+    def _passing_object(self, start: Pose, model: ObjectModel, rng: Rng) -> MovingObject:
         """Something about as large as the object, nearer, that passes in front of it."""
-        thing = self.clutter.draw(rng, model.diameter)
+        shape = self.clutter.draw(rng, model.diameter)
         angle = rng.uniform(0, 2 * np.pi)
         reach = 2.0 * model.diameter * np.array([np.cos(angle), np.sin(angle), 0.0])
         R = random_rotation(rng)
-        middle = Pose(R, 0.6 * start.apply(model.center) - R @ thing.center)
-        return Thing(None, thing, passing(middle, reach, self.config.frames / RATE))
+        middle = Pose(R, 0.6 * start.apply(model.center) - R @ shape.center)
+        return MovingObject(None, shape, passing(middle, reach, self.config.frames / RATE))
 
-    # --- how it looks ---
+    # --- drawing ---
 
-    def _frame(self, take: Take, seconds: float) -> Drawn:
+    def _frame(self, plan: SequencePlan, seconds: float) -> Drawn:
         """Sharp where little moves while the shutter is open, else the mean of several moments."""
-        drawn = self._moment(take, seconds)
-        count = _moments(take, seconds)
+        drawn = self._moment(plan, seconds)
+        count = _moments(plan, seconds)
         if count == 1:
             return drawn
         offsets = np.linspace(-0.5, 0.5, count) * SHUTTER
-        images = [drawn.image if k == count // 2 else self._moment(take, seconds + float(offset)).image
+        images = [drawn.image if k == count // 2 else self._moment(plan, seconds + float(offset)).image
                   for k, offset in enumerate(offsets)]  # fmt: skip
         light = np.mean([np.square(image, dtype=np.float32) for image in images], axis=0)  # about linear in light
         return dataclasses.replace(drawn, image=np.sqrt(light).round().astype(np.uint8))
 
-    def _moment(self, take: Take, seconds: float) -> Drawn:
-        T_cam_world = take.T_cam_world(seconds)
-        objects = [Placed(thing.obj_id, thing.model, T_cam_world @ thing.T_world_obj(seconds)) for thing in take.things]
-        return draw_objects(self.renderer, objects, take.camera, take.light, _seen(take.wide, take.camera, T_cam_world))
+    def _moment(self, plan: SequencePlan, seconds: float) -> Drawn:
+        T_cam_world = plan.T_cam_world(seconds)
+        objects = [
+            Placed(shape.obj_id, shape.model, T_cam_world @ shape.T_world_obj(seconds)) for shape in plan.objects
+        ]
+        return draw_objects(self.renderer, objects, plan.camera, plan.light, _seen(plan.wide, plan.camera, T_cam_world))
 
 
 def sequences(config: SynthConfig) -> dict[str, Any]:
@@ -149,15 +152,15 @@ def _outside(start: Pose, model: ObjectModel, camera: Camera, rng: Rng) -> NDArr
     return np.array([sign * far, y, distance] if side < 2 else [x, sign * far, distance])
 
 
-def _moments(take: Take, seconds: float) -> int:
+def _moments(plan: SequencePlan, seconds: float) -> int:
     """How many moments a frame needs, odd, by the longest way that a point of an object makes in the picture."""
     ends = [seconds - SHUTTER / 2, seconds + SHUTTER / 2]
     longest = 0.0
-    for thing in take.things:
-        few = thing.model.hull_vertices[:: max(1, len(thing.model.hull_vertices) // 64)]
-        points = [(take.T_cam_world(s) @ thing.T_world_obj(s)).apply(few) for s in ends]
+    for shape in plan.objects:
+        few = shape.model.hull_vertices[:: max(1, len(shape.model.hull_vertices) // 64)]
+        points = [(plan.T_cam_world(s) @ shape.T_world_obj(s)).apply(few) for s in ends]
         if min(p[:, 2].min() for p in points) > 1e-3:
-            way = take.camera.project(points[1]) - take.camera.project(points[0])
+            way = plan.camera.project(points[1]) - plan.camera.project(points[0])
             longest = max(longest, float(np.linalg.norm(way, axis=1).max()))
     return int(min(MOMENTS, 1 + 2 * round(longest / STEP / 2)))
 

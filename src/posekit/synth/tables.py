@@ -30,6 +30,7 @@ class Tables:
         self.tabletop = TabletopConfig(size=config.size, objects=OBJECTS)
 
     def block(self, number: int, places: Sequence[int]) -> Iterator[tuple[int, Picture]]:
+        """(place, picture) for each place, from block ``number``'s own random numbers."""
         for place in places:
             yield place, self._picture(np.random.default_rng([self.config.seed, 0, number]))
 

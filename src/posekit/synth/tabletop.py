@@ -19,6 +19,7 @@ from posekit.errors import ConfigError
 from posekit.geometry import Pose, random_rotation, rotation_between, so3_exp
 from posekit.mesh.model import ObjectModel
 from posekit.render import Light, Renderer
+from posekit.synth.canvas import Canvas, tile
 from posekit.synth.light import random_light
 from posekit.synth.procedural import noise_image, photo_crop, random_colour, random_object, random_texture
 from posekit.view import View
@@ -50,7 +51,7 @@ class TabletopConfig:
     spread: tuple[float, float] = (1.0, 3.0)  # radius in which objects lie
     shadow: float = 0.7  # share of tables with shadows
     paint: float = 1.0  # how far the objects' paint strays from the meshes', 0 = not at all
-    scraps: tuple[int, int] = (0, 0)  # least and most parts cut out of photographs that lie about behind the objects
+    scraps: tuple[int, int] = (0, 0)  # least and most parts cut out of photographs behind the objects
 
     def __post_init__(self) -> None:
         if not 0 <= self.objects[0] <= self.objects[1] or not 0 <= self.distractors[0] <= self.distractors[1]:
@@ -118,18 +119,18 @@ def compose(
     T_cam_world = _camera_pose(unit, config, rng)
     camera = Camera.from_fov(float(np.deg2rad(rng.uniform(*config.fov_deg))), *config.size)
     light = random_light(rng)
-    canvas = _Canvas(_backdrop(config, photos, rng), camera)
+    canvas = Canvas(_backdrop(config, photos, rng))
     if table:
-        _draw_table(canvas, renderer, T_cam_world, unit, light, photos, rng)
+        _draw_table(canvas, camera, renderer, T_cam_world, unit, light, photos, rng)
         if rng.random() < config.shadow:
-            _draw_shadows(canvas, [m for _, m in chosen], T_world_objs, T_cam_world, light, rng)
+            _draw_shadows(canvas, camera, [m for _, m in chosen], T_world_objs, T_cam_world, light, rng)
     if len(photos):
         for _ in range(int(rng.integers(config.scraps[0], config.scraps[1] + 1))):
             _lay_scrap(canvas.image, photos, rng)
-    found = []
+    found: list[tuple[int, ObjectModel, Pose, int]] = []
     for (number, model), T_world_obj in zip(chosen, T_world_objs, strict=True):
         T_cam_obj = T_cam_world @ T_world_obj
-        whole = canvas.add(renderer, model, T_cam_obj, light, config.paint, rng)
+        whole = _add(canvas, len(found) + 1, renderer, model, T_cam_obj, camera, light, config.paint, rng)
         if whole:
             found.append((number, model, T_cam_obj, whole))
     canvas.smooth_edges()
@@ -249,61 +250,26 @@ def _camera_pose(unit: float, config: TabletopConfig, rng: Rng) -> Pose:
 # --- drawing ----------------------------------------------------------------------------------------------------
 
 
-class _Canvas:
-    """The picture so far; what is added is in front where its depth is less."""
-
-    def __init__(self, image: Image, camera: Camera) -> None:
-        self.image, self.camera = image, camera
-        self.depth = np.zeros(image.shape[:2], np.float32)
-        self.labels = np.zeros(image.shape[:2], np.int16)
-        self.count = 0
-
-    def add(self, renderer: Renderer, model: ObjectModel, T_cam_obj: Pose, light: Light, paint: float, rng: Rng) -> int:
-        """Draw an object; returns the pixels of its whole silhouette, 0 where it is not in the picture at all, too
-        near or too large to draw."""
-        points = T_cam_obj.apply(model.hull_vertices)
-        if points[:, 2].min() < 0.2 * model.diameter:
-            return 0
-        x0, y0, x1, y1 = self.camera.points_box(points)
-        side = next((s for s in TILES if s >= max(x1 - x0, y1 - y0) + 2), None)
-        if side is None or x1 <= 0 or y1 <= 0 or x0 >= self.camera.width or y0 >= self.camera.height:
-            return 0
-        left, top = int(np.floor(0.5 * (x0 + x1 - side))), int(np.floor(0.5 * (y0 + y1 - side)))
-        drawn = renderer.render(model, [T_cam_obj], self.camera.cropped(left, top, side, side), light=light)[0]
-        assert drawn.mask is not None and drawn.depth is not None
-        if not drawn.mask.any():
-            return 0
-        self.count += 1
-        self._paste(repainted(drawn.image, paint, rng), drawn.mask, drawn.depth, left, top, self.count)
-        return int(drawn.mask.sum())
-
-    def _paste(
-        self, image: Image, mask: NDArray[np.bool_], depth: NDArray[np.float32], left: int, top: int, label: int
-    ) -> None:
-        width, height = self.camera.size
-        first, last = max(0, top), min(height, top + mask.shape[0])
-        start, stop = max(0, left), min(width, left + mask.shape[1])
-        here = (slice(first, last), slice(start, stop))
-        there = (slice(first - top, last - top), slice(start - left, stop - left))
-        mine, known = depth[there], self.depth[here]
-        nearer = mask[there] & ((known == 0) | (mine < known))
-        self.image[here][nearer] = image[there][nearer]
-        self.depth[here][nearer] = mine[nearer]
-        self.labels[here][nearer] = label
-
-    def lay(self, view: View) -> None:
-        """Draw a view of the whole picture without a label."""
-        assert view.mask is not None and view.depth is not None
-        self._paste(view.image, view.mask, view.depth, 0, 0, 0)
-
-    def smooth_edges(self) -> None:
-        """Mix the colours along the outlines, as a lens does."""
-        edge = np.zeros(self.labels.shape, bool)
-        edge[1:] |= self.labels[1:] != self.labels[:-1]
-        edge[:-1] |= self.labels[1:] != self.labels[:-1]
-        edge[:, 1:] |= self.labels[:, 1:] != self.labels[:, :-1]
-        edge[:, :-1] |= self.labels[:, 1:] != self.labels[:, :-1]
-        self.image[edge] = cv2.GaussianBlur(self.image, (3, 3), 0.7)[edge]
+def _add(
+    canvas: Canvas, label: int, renderer: Renderer, model: ObjectModel, T_cam_obj: Pose, camera: Camera, light: Light,
+    paint: float, rng: Rng,
+) -> int:  # fmt: skip
+    """Draw an object; returns the pixels of its whole silhouette, 0 where it is not in the picture at all, too near or
+    too large to draw."""
+    points = T_cam_obj.apply(model.hull_vertices)
+    if points[:, 2].min() < 0.2 * model.diameter:
+        return 0
+    x0, y0, x1, y1 = camera.points_box(points)
+    found = tile(camera, points, TILES)
+    if found is None or x1 <= 0 or y1 <= 0 or x0 >= camera.width or y0 >= camera.height:
+        return 0
+    part, left, top = found
+    drawn = renderer.render(model, [T_cam_obj], part, light=light)[0]
+    assert drawn.mask is not None and drawn.depth is not None
+    if not drawn.mask.any():
+        return 0
+    canvas.paste(repainted(drawn.image, paint, rng), drawn.mask, drawn.depth, label, left, top)
+    return int(drawn.mask.sum())
 
 
 def repainted(image: Image, strength: float, rng: Rng) -> Image:
@@ -348,8 +314,9 @@ def _lay_scrap(image: Image, photos: Sequence[Image], rng: Rng) -> None:
 
 
 def _draw_table(
-    canvas: _Canvas, renderer: Renderer, T_cam_world: Pose, unit: float, light: Light, photos: Sequence[Image], rng: Rng
-) -> None:
+    canvas: Canvas, camera: Camera, renderer: Renderer, T_cam_world: Pose, unit: float, light: Light,
+    photos: Sequence[Image], rng: Rng,
+) -> None:  # fmt: skip
     """A textured rectangle at z = 0."""
     half = 0.5 * unit * rng.uniform(5, 16, size=2)
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32) * [*half, 0]
@@ -361,7 +328,9 @@ def _draw_table(
         uvs=np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32),
         texture=_table_texture(photos, rng),
     )
-    canvas.lay(renderer.render(table, [T_cam_world], canvas.camera, light=light)[0])
+    view = renderer.render(table, [T_cam_world], camera, light=light)[0]
+    assert view.mask is not None and view.depth is not None
+    canvas.paste(view.image, view.mask, view.depth, 0)
 
 
 def _table_texture(photos: Sequence[Image], rng: Rng) -> Image:
@@ -373,8 +342,8 @@ def _table_texture(photos: Sequence[Image], rng: Rng) -> Image:
 
 
 def _draw_shadows(
-    canvas: _Canvas, models: Sequence[ObjectModel], T_world_objs: Sequence[Pose], T_cam_world: Pose, light: Light,
-    rng: Rng,
+    canvas: Canvas, camera: Camera, models: Sequence[ObjectModel], T_world_objs: Sequence[Pose], T_cam_world: Pose,
+    light: Light, rng: Rng,
 ) -> None:  # fmt: skip
     """Darken the table where objects stand between it and the light; soft outlines of their hulls."""
     towards = np.asarray(light.direction) @ T_cam_world.R
@@ -385,9 +354,9 @@ def _draw_shadows(
         points = T_world_obj.apply(model.hull_vertices)
         fallen = T_cam_world.apply(points - points[:, 2:] / towards[2] * towards)
         if fallen[:, 2].min() > 0.2 * model.diameter:
-            pixels = canvas.camera.project(fallen).clip(-4000, 4000).astype(np.int32)
+            pixels = camera.project(fallen).clip(-4000, 4000).astype(np.int32)
             cv2.fillConvexPoly(shadow, cv2.convexHull(pixels.reshape(-1, 1, 2)), 255)
-    softness = float(rng.uniform(0.005, 0.03)) * canvas.camera.width
+    softness = float(rng.uniform(0.005, 0.03)) * camera.width
     soft = cv2.GaussianBlur(shadow.astype(np.float32) / 255, (0, 0), softness)
     strength = light.diffuse / (light.ambient + light.diffuse) * rng.uniform(0.5, 1.0)
     factor = np.where(canvas.depth > 0, 1 - np.float32(strength) * soft, 1.0)

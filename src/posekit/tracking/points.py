@@ -22,14 +22,15 @@ from posekit.mesh.model import ObjectModel
 from posekit.view import View
 
 WINDOW, LEVELS = (13, 13), 3
-CORNERS, QUALITY, APART = 200, 0.005, 3  # at most; of the best one; pixels between two
-AGAIN = 0.7  # pixels from where it started that a point followed forwards and backwards may end
+CORNERS, QUALITY, LEAST_DISTANCE = 200, 0.005, 3  # at most; of the best one; pixels between two
+MOST_RETURN_ERROR = 0.7  # pixels from where it started that a point followed forwards and backwards may end
 LEAST = 6  # points
-SIGMA, CORRELATED = 0.5, 3.0  # pixels, expected error of a followed point; so many err alike
+# pixels, expected error of a followed point; the number of neighbours whose errors are correlated
+SIGMA, CORRELATED = 0.5, 3.0
 # the same where the mesh's drawing is matched with the frame; and how far off a match may be, pixels
 TEXTURE_QUALITY, TEXTURE_SIGMA, TEXTURE_CORRELATED, FARTHEST = 0.02, 1.0, 0.7, 5.0
-ALIKE = (0.5, 0.8)  # correlations of patches from which on a match counts, and counts wholly
-PATCH, ROUND, FAINT = 9, 4.0, 4.0  # pixels; pixels; grey values below which contrast is noise
+CORRELATION_RANGE = (0.5, 0.8)  # correlations of patches from which on a match counts, and counts wholly
+PATCH, CONTRAST_SIGMA, LEAST_CONTRAST = 9, 4.0, 4.0  # pixels; pixels; grey values below which contrast is noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +57,7 @@ class Keyframe:
         assert self.drawn.mask is not None
         solid = self.drawn.mask & self.visible & self.seen.shown
         inside = cv2.erode(solid.astype(np.uint8), np.ones((5, 5), np.uint8))
-        corners = cv2.goodFeaturesToTrack(self.grey, CORNERS, QUALITY, APART, mask=inside)
+        corners = cv2.goodFeaturesToTrack(self.grey, CORNERS, QUALITY, LEAST_DISTANCE, mask=inside)
         return np.zeros((0, 1, 2), np.float32) if corners is None else np.asarray(corners, np.float32)
 
     @cached_property
@@ -102,7 +103,7 @@ def follow_points(before: Keyframe, pose: Pose, after: View, model: ObjectModel)
 
 
 def match_texture(keyframe: Keyframe, model: ObjectModel) -> Points | None:
-    """Points of the mesh, as drawn, and where the frame shows the same texture; None where too few are alike.
+    """Points of the mesh, as drawn, and where the frame shows the same texture; None where too few are similar.
 
     Both pictures are compared by their local contrast, since the light differs.
     """
@@ -111,7 +112,7 @@ def match_texture(keyframe: Keyframe, model: ObjectModel) -> Points | None:
     first, second = (_contrast(v.image) for v in (drawn, keyframe.seen))
     solid = drawn.mask & keyframe.visible & keyframe.seen.shown
     inside = cv2.erode(solid.astype(np.uint8), np.ones((7, 7), np.uint8))
-    corners = cv2.goodFeaturesToTrack(first, CORNERS, TEXTURE_QUALITY, APART, mask=inside)
+    corners = cv2.goodFeaturesToTrack(first, CORNERS, TEXTURE_QUALITY, LEAST_DISTANCE, mask=inside)
     if corners is None or len(corners) < LEAST:
         return None
     places, steady = _followed(first, second, corners)
@@ -121,8 +122,8 @@ def match_texture(keyframe: Keyframe, model: ObjectModel) -> Points | None:
         return None
     corners, places = corners[steady], places[steady]
     columns, rows = np.rint(corners).astype(int).T
-    least, best = ALIKE
-    weight = np.clip((_alike(first, second, corners, places) - least) / (best - least), 0, 1).astype(np.float64)
+    least, best = CORRELATION_RANGE
+    weight = np.clip((_correlation(first, second, corners, places) - least) / (best - least), 0, 1).astype(np.float64)
     if (weight > 0).sum() < LEAST:
         return None
     points = drawn.coords[rows, columns].astype(np.float64) - model.center
@@ -133,12 +134,12 @@ def match_texture(keyframe: Keyframe, model: ObjectModel) -> Points | None:
 def _contrast(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Grey values (H, W) less their surroundings' mean, over the surroundings' spread."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    centred = grey - cv2.GaussianBlur(grey, (0, 0), ROUND)
-    spread = np.sqrt(cv2.GaussianBlur(centred * centred, (0, 0), ROUND)) + FAINT
+    centred = grey - cv2.GaussianBlur(grey, (0, 0), CONTRAST_SIGMA)
+    spread = np.sqrt(cv2.GaussianBlur(centred * centred, (0, 0), CONTRAST_SIGMA)) + LEAST_CONTRAST
     return np.asarray(np.clip(128 + 40 * centred / spread, 0, 255), np.uint8)
 
 
-def _alike(
+def _correlation(
     first: NDArray[np.uint8], second: NDArray[np.uint8], corners: NDArray[np.float32], places: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     """Correlation (N,), -1 to 1, of the first picture round each corner with the second round its place."""
@@ -163,4 +164,4 @@ def _followed(
     there, ahead, _ = cv2.calcOpticalFlowPyrLK(first, second, corners, None, winSize=WINDOW, maxLevel=LEVELS)
     back, behind, _ = cv2.calcOpticalFlowPyrLK(second, first, there, None, winSize=WINDOW, maxLevel=LEVELS)
     away = np.linalg.norm((back - corners)[:, 0], axis=1)
-    return there[:, 0], (ahead.ravel() > 0) & (behind.ravel() > 0) & (away < AGAIN)
+    return there[:, 0], (ahead.ravel() > 0) & (behind.ravel() > 0) & (away < MOST_RETURN_ERROR)

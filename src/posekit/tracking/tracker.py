@@ -35,23 +35,24 @@ from posekit.view import View
 
 TRACKED, RESTARTED, LOST = "tracked", "restarted", "lost"
 MASKS, MOTIONS, RUNTIMES = ("colours", "pose", "none"), ("points", "velocity", "none"), ("openvino", "torch")
-NEAR = 0.6  # diameters, the least distance of an object's centre that is believed
+NEAR = 0.6  # diameters, the least distance of an object's centre that is accepted
 # standard deviations of a turn in degrees, a shift in pixels of the crop, and a depth in shares of the distance
 GIVEN = (1.0, 0.5, 0.005)  # of a first pose
-AHEAD = (10.0, 8.0, 0.05)  # of the motion between two frames, where they are compared
-UNSEEN = (6.0, 4.0, 0.02)  # of that motion, when nothing else is known about it
-SUREST = (0.5, 0.15, 0.004)  # of any pose: errors last over many frames
-CORRELATED = 25.0  # so many correspondences err alike
-DOUBTED = math.radians(4.0)  # at this predicted angle twice as many do
-TINTED = 0.15  # share of a frame in what is known of the tint
+PREDICTED = (10.0, 8.0, 0.05)  # of the motion between two frames, where they are compared
+UNPREDICTED = (6.0, 4.0, 0.02)  # of that motion, when nothing else is known about it
+LEAST_STD = (0.5, 0.15, 0.004)  # of any pose, at least: errors last over many frames
+CORRELATED = 25.0  # number of correspondences whose errors are correlated
+ANGLE_OF_DOUBLE = math.radians(4.0)  # predicted angle at which that number doubles
+TINT_RATE = 0.15  # weight of a frame in the running tint
 FACES = 6000  # of the mesh that is drawn: a crop shows no more
 LEAST_SCALE, KNEE = 0.5, 2.5  # pixels, no correspondence is more exact; standard deviations
 
 
 class Finder(Protocol):
-    """Whatever finds objects in a photograph, such as posekit.detect's and posekit.detect.novel's detectors."""
+    """A detector of objects in a photograph, such as posekit.detect's and posekit.detect.novel's detectors."""
 
-    def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]: ...
+    def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
+        """Instances of the models in the picture, by falling score."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ class TrackConfig:
     # pose to points and outline, both degrees
     restart_deg: float = 25.0
     still_deg: float = 0.0
-    converged_deg: float = 2.0  # the predicted angle below which an estimate says that it converged
+    converged_deg: float = 2.0  # the predicted angle below which an estimate counts as converged
     again_deg: float = 8.0
     iterations: int = 1  # comparisons of a frame at most; a second one follows a turn of more than ``again_deg``
     # where a frame's comparison starts: where followed points lead ("points"), the share ``prior`` of the last motion
@@ -76,8 +77,8 @@ class TrackConfig:
     # what a frame's mask is taken to be: where the silhouette has the object's colours ("colours"), all of it
     # ("pose"), or nothing ("none")
     mask: str = "colours"
-    keep: float = 0.7  # share of what was known that holds for the next frame
-    alike: float = 0.3  # share of the silhouette with the object's colours, below which a frame is in doubt
+    keep: float = 0.7  # share of the information that is kept for the next frame
+    min_colour_share: float = 0.3  # share of the silhouette with the object's colours, below which a frame is in doubt
     learn: float = 0.1  # share of a frame in these colours
     least_inside: float = 0.3  # share of the silhouette's box in the picture, likewise
     doubts: int = 3  # frames in doubt in a row after which the object is lost
@@ -92,8 +93,8 @@ class TrackConfig:
             )
         if min(self.iterations, self.doubts, self.search) < 1:
             raise ConfigError("iterations, doubts and search are at least 1.")
-        if not all(0 <= share <= 1 for share in (self.prior, self.alike, self.learn, self.least_inside)):
-            raise ConfigError("prior, alike, learn and least_inside are shares between 0 and 1.")
+        if not all(0 <= share <= 1 for share in (self.prior, self.min_colour_share, self.learn, self.least_inside)):
+            raise ConfigError("prior, min_colour_share, learn and least_inside are shares between 0 and 1.")
         if not 0 < self.keep <= 1:
             raise ConfigError(f"keep is a share above 0, at most 1, not {self.keep:g}.")
         for name, known in (("mask", MASKS), ("motion", MOTIONS), ("runtime", RUNTIMES)):
@@ -103,7 +104,7 @@ class TrackConfig:
 
 @dataclass(frozen=True, eq=False)
 class Tracked:
-    """What a frame says about the object. state: "tracked", "restarted" (a new first pose) or "lost". estimate: None
+    """The result for a frame. state: "tracked", "restarted" (a new first pose) or "lost". estimate: None
     where it is lost; its score is the share of its silhouette that has the object's colours."""
 
     state: str
@@ -111,6 +112,7 @@ class Tracked:
 
     @property
     def T_cam_obj(self) -> Pose | None:
+        """The pose, metres; None where the object is not seen."""
         return None if self.estimate is None else self.estimate.T_cam_obj
 
     @property
@@ -153,9 +155,9 @@ class Tracker:
         self.renderer, self.detector = self.estimator.renderer, detector
         self._drawn = model.simplified(FACES)
         self._outline = model.hull_ctr
-        self._beside = ThreadPoolExecutor(1, "posekit-network")
-        self._given = pose  # a first pose that no frame has been seen with
-        self._told = pose  # the last ``T_cam_obj`` that was told, whether or not the object was lost since
+        self._executor = ThreadPoolExecutor(1, "posekit-network")
+        self._given = pose  # a first pose that no frame has been compared with
+        self._last_pose = pose  # the last ``T_cam_obj`` that was returned, whether or not the object was lost since
         self._state: GaussianPose | None = None  # ``T_cam_ctr``
         self._motion = Pose.identity()  # of the object's centre and axes, from the frame before the last to the last
         self._before: Keyframe | None = None
@@ -178,15 +180,15 @@ class Tracker:
             started, pose, self._given = time.perf_counter(), self._given, None
             if self._begin(view, pose, math.radians(GIVEN[0])):
                 assert self._before is not None
-                prediction, network = self._asked(self._before.seen, self._before.drawn, self._before.visible)
+                prediction, network = self._compared(self._before.seen, self._before.drawn, self._before.visible)
                 timings = {"network": network, "total": time.perf_counter() - started}
                 given = self._estimate(view, pose, prediction.angle, 0, 1.0, timings)
                 return Tracked(TRACKED, self._on_branch(given, Branch.GIVEN))
         if self._state is not None:
             found = self._follow(view, self._state)
-            if found is not None and not self._lost_sight(view, found):
+            if found is not None and not self._is_lost(view, found):
                 return Tracked(TRACKED, self._on_branch(found))
-            self._lose()
+            self._reset()
         return self._find(view)
 
     # --- following ---
@@ -216,8 +218,8 @@ class Tracker:
         started, network, angle, comparisons = time.perf_counter(), 0.0, 0.0, 0
         before, colours, tint = self._before, self._colours, self._tint
         assert before is not None and colours is not None and tint is not None
-        ahead = self._ahead(view, before, last, colours)
-        state = ahead
+        predicted = self._predicted(view, before, last, colours)
+        state = predicted
         while comparisons < self.config.iterations:
             comparisons += 1
             pose = state.pose @ self.model.T_ctr_obj
@@ -227,20 +229,20 @@ class Tracker:
             assert drawn.mask is not None
             apart = off_colour(seen, drawn)
             visible = colours.seen(seen) & ~tint.hides(apart, drawn.mask)
-            answer = self._beside.submit(self._asked, seen, drawn, visible)
-            # while the network thinks
+            answer = self._executor.submit(self._compared, seen, drawn, visible)
+            # while the network computes
             keyframe = Keyframe(seen, drawn, Pose.rotation(seen.R_view_cam) @ state.pose, visible)
-            others = self._lines(keyframe, seen, visible, colours) + self._texture(keyframe)
-            learned = colours.mixed(learn(seen, drawn.mask, visible), self.config.learn)
-            tinted = tint.mixed(Tint.of(apart, visible & drawn.mask), TINTED)
+            more = self._lines(keyframe, seen, visible, colours) + self._texture(keyframe)
+            new_colours = colours.mixed(learn(seen, drawn.mask, visible), self.config.learn)
+            new_tint = tint.mixed(Tint.of(apart, visible & drawn.mask), TINT_RATE)
             keyframe.prepare()
             prediction, seconds = answer.result()
             network, angle = network + seconds, prediction.angle
-            agreed = self._agreed(ahead, keyframe, prediction, others)
-            if agreed is None:
+            combined = self._combined(predicted, keyframe, prediction, more)
+            if combined is None:
                 return None
-            turn = math.degrees(rotation_angle(agreed.pose.R @ state.pose.R.T))
-            state = agreed
+            turn = math.degrees(rotation_angle(combined.pose.R @ state.pose.R.T))
+            state = combined
             if turn < self.config.again_deg:
                 break
         pose = state.pose @ self.model.T_ctr_obj
@@ -251,21 +253,21 @@ class Tracker:
         share = float((visible & shown).sum() / max(1, shown.sum()))
         self._motion = Pose(state.pose.R @ last.pose.R.T, state.pose.t - last.pose.t)
         self._state, self._before = state, keyframe
-        if angle < math.radians(self.config.restart_deg) and share > self.config.alike:
-            self._colours = learned
-        self._tint = tinted
+        if angle < math.radians(self.config.restart_deg) and share > self.config.min_colour_share:
+            self._colours = new_colours
+        self._tint = new_tint
         timings = {"network": network, "total": time.perf_counter() - started}
         return self._estimate(view, pose, angle, comparisons, share, timings)
 
-    def _ahead(self, view: View, before: Keyframe, last: GaussianPose, colours: Colours) -> GaussianPose:
+    def _predicted(self, view: View, before: Keyframe, last: GaussianPose, colours: Colours) -> GaussianPose:
         """Where the object is expected, as ``T_cam_ctr``: from the last frame, without a comparison with the mesh."""
         camera, R = before.drawn.camera, before.seen.R_view_cam
-        believed = last.turned(R)
-        start = self._expected(believed.pose, R)
-        known: list[Residual] = [_about(start, camera, AHEAD)]
-        motion: list[Residual] = [_about(start, camera, UNSEEN)]
+        in_view = last.turned(R)
+        start = self._expected(in_view.pose, R)
+        known: list[Residual] = [_about(start, camera, PREDICTED)]
+        motion: list[Residual] = [_about(start, camera, UNPREDICTED)]
         seen = before.again(view)
-        following = self._beside.submit(self._followed, before, start, seen)
+        following = self._executor.submit(self._followed, before, start, seen)
         lines = self._lines(before, seen, before.visible, colours)
         points = following.result()
         known += points
@@ -273,7 +275,7 @@ class Tracker:
         found = fuse(start, [*known, *lines], camera)
         pose = start if found is None else found.pose
         moved = np.sum([residual.equations(pose, camera)[0] for residual in motion], axis=0)
-        covariance = believed.covariance / self.config.keep + np.linalg.inv(moved)
+        covariance = in_view.covariance / self.config.keep + np.linalg.inv(moved)
         return GaussianPose(pose, np.asarray(np.linalg.inv(covariance))).turned(R.T)
 
     def _expected(self, last: Pose, R_view_cam: NDArray[np.float64]) -> Pose:
@@ -284,18 +286,18 @@ class Tracker:
         turn = so3_exp(R_view_cam @ so3_log(self._motion.R) * share)
         return Pose(turn @ last.R, last.t + share * (R_view_cam @ self._motion.t))
 
-    def _agreed(
-        self, ahead: GaussianPose, keyframe: Keyframe, prediction: PairPrediction, others: list[Residual]
+    def _combined(
+        self, predicted: GaussianPose, keyframe: Keyframe, prediction: PairPrediction, more: list[Residual]
     ) -> GaussianPose | None:
-        """What the network, others that compare the mesh, and the frames before say together."""
+        """The pose by the network, by what else compares the mesh, and by the frames before."""
         camera, R = keyframe.drawn.camera, keyframe.seen.R_view_cam
         network: list[Residual] = []
         if self.config.still_deg <= math.degrees(prediction.angle) < self.config.restart_deg:
             network = self._network(keyframe, prediction)
-        found = fuse(keyframe.T_view_ctr, [ahead.turned(R), *network, *others], camera)
+        found = fuse(keyframe.T_view_ctr, [predicted.turned(R), *network, *more], camera)
         if found is None:
             return None
-        return found.spread(_about(found.pose, camera, SUREST).covariance).turned(R.T)
+        return found.spread(_about(found.pose, camera, LEAST_STD).covariance).turned(R.T)
 
     def _followed(self, before: Keyframe, start: Pose, seen: View) -> list[Residual]:
         found = follow_points(before, start, seen, self.model) if self.config.motion == "points" else None
@@ -317,8 +319,8 @@ class Tracker:
         [seen], [drawn] = crops(view, self._drawn, self._outline, [pose], self.predictor.size, self.renderer)
         return seen, drawn
 
-    def _asked(self, seen: View, drawn: View, visible: NDArray[np.bool_]) -> tuple[PairPrediction, float]:
-        """The network's answer, and the seconds that it took."""
+    def _compared(self, seen: View, drawn: View, visible: NDArray[np.bool_]) -> tuple[PairPrediction, float]:
+        """The network's output, and the seconds that it took."""
         assert drawn.mask is not None
         mask = {"colours": drawn.mask & visible, "pose": drawn.mask, "none": None}[self.config.mask]
         started = time.perf_counter()
@@ -336,7 +338,7 @@ class Tracker:
         points = keyframe.drawn.coords[found.source[:, 1], found.source[:, 0]] - self.model.center
         if not len(points):
             return []
-        correlated = CORRELATED * (1 + (prediction.angle / DOUBTED) ** 2)
+        correlated = CORRELATED * (1 + (prediction.angle / ANGLE_OF_DOUBLE) ** 2)
         scale = np.maximum(found.scale_px, LEAST_SCALE)
         return [Points(points.astype(np.float64), found.target, found.weight, scale, KNEE, correlated)]
 
@@ -351,31 +353,31 @@ class Tracker:
         return bool(np.isfinite(pose.matrix).all() and pose.apply(self.model.center)[2] > NEAR * self.model.diameter)
 
     def _on_branch(self, found: Estimate, branch: Branch = Branch.LAST) -> Estimate:
-        """Of equivalent poses the one nearest to the last one that was told, where there is one."""
-        if self._told is not None:
-            found = nearest_to(self._told, found, self.model, branch)
+        """Of equivalent poses the one nearest to the last one that was returned, where there is one."""
+        if self._last_pose is not None:
+            found = nearest_to(self._last_pose, found, self.model, branch)
         elif self.model.symmetries:
             found = replace(found, branch=Branch.ANY)
-        self._told = found.T_cam_obj
+        self._last_pose = found.T_cam_obj
         return found
 
     # --- losing and finding ---
 
-    def _lost_sight(self, view: View, found: Estimate) -> bool:
+    def _is_lost(self, view: View, found: Estimate) -> bool:
         """Whether too little of the object has been seen for too long; at once where it is outside the picture."""
         x0, y0, x1, y1 = found.box
         width, height = view.camera.size
         inside = max(0.0, min(x1, width) - max(x0, 0.0)) * max(0.0, min(y1, height) - max(y0, 0.0))
         share = inside / max((x1 - x0) * (y1 - y0), 1e-9)
-        doubted = (
+        in_doubt = (
             share < self.config.least_inside
-            or found.score < self.config.alike
+            or found.score < self.config.min_colour_share
             or math.degrees(found.angle) > self.config.restart_deg
         )
-        self._doubts = self._doubts + 1 if doubted else 0
+        self._doubts = self._doubts + 1 if in_doubt else 0
         return share == 0 or self._doubts >= self.config.doubts
 
-    def _lose(self) -> None:
+    def _reset(self) -> None:
         self._state = self._before = self._colours = None
         self._motion, self._doubts, self._waiting = Pose.identity(), 0, 0
 
@@ -386,7 +388,7 @@ class Tracker:
             return Tracked(LOST)
         self._waiting = self.config.search
         detections = self.detector.detect(view, [self.model])
-        # nobody vouches for every frame's detections: poses must be borne out, whoever detects
+        # detections of single frames may be wrong, whatever the detector: poses need the usual minimum score
         [found] = find_instances(lambda _: self.estimator, view, [self.model], detections, SearchOptions())
         if not found.instances or not self._begin(view, found.instances[0].T_cam_obj, found.instances[0].angle):
             return Tracked(LOST)
@@ -400,11 +402,9 @@ def _about(pose: Pose, camera: Camera, spread: tuple[float, float, float]) -> Ga
 
 
 def _predictor(estimator: PoseEstimator, config: TrackConfig) -> Predictor:
-    if config.runtime == "torch" or estimator.predictor.device.type != "cpu":
+    if config.runtime == "torch" or estimator.runtime.runtime == "torch":
         return estimator.predictor
-    from posekit.nets.openvino import OpenVinoPredictor
-
-    return OpenVinoPredictor(estimator.networks, threads=max(1, usable_cores() // 2))  # the rest works beside it
+    return estimator.runtime.predictor_for(1, max(1, usable_cores() // 2))  # the rest works beside it
 
 
 def _before_camera(points: NDArray[np.float64]) -> NDArray[np.float64]:

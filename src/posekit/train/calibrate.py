@@ -1,8 +1,8 @@
-"""The predicted angle, made honest: SV-Net's angle head, fitted to what refinement really leaves.
+"""The predicted angle, calibrated: SV-Net's angle head, fitted to the errors that refinement leaves.
 
 In a training the head sees poses disturbed at random. The loop asks it about poses that the network itself has moved,
-where what is left is what the network cannot see: there the head was far too sure. So once the rest is trained, the
-head alone (one linear layer) is fitted again, on the poses that the loop passes through.
+where what is left is what the network cannot see: there the head predicted far too small errors. So once the rest is
+trained, the head alone (one linear layer) is fitted again, on the poses that the loop passes through.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from posekit.errors import TrainingError
 from posekit.estimate.refine import compare, update_pose
 from posekit.geometry import Pose, random_rotation, rotation_angle
 from posekit.nets.heads import compress_angle
-from posekit.nets.predictor import NetworkPredictor
+from posekit.nets.pytorch import NetworkPredictor
 from posekit.nets.weights import Networks
 from posekit.render import Renderer
 from posekit.train.measure import Case
@@ -76,8 +76,8 @@ def passed_poses(
 
 
 def calibrate(networks: Networks, cases: Sequence[Case], renderer: Renderer, tell: Tell | None = None) -> Networks:
-    """The networks with an angle head whose median is right where the loop asks it. Raises TrainingError where there
-    are too few cases or the network answers nothing finite."""
+    """The networks with an angle head whose median is right on the poses of the loop. Raises TrainingError where there
+    are too few cases or the network's outputs are not finite."""
     passed = passed_poses(networks, cases, renderer, tell=tell)
     if len(passed.angle) < LEAST or not np.isfinite(passed.features).all():
         raise TrainingError(

@@ -15,9 +15,8 @@ import tomli_w
 
 from posekit.errors import ConfigError
 from posekit.io.files import read_text
-from posekit.nets.lite import LiteConfig
+from posekit.nets.config import LiteConfig, PaperConfig
 from posekit.nets.losses import DenseLossConfig
-from posekit.nets.weights import PaperConfig
 from posekit.train.data.stream import StreamConfig
 
 RECIPES = ("lite", "paper")
@@ -92,7 +91,7 @@ class SourceConfig:
     # recipe)
     bop: tuple[str, ...] = ()
     renders: float = 1.0  # weight of renderings beside them
-    # folders of meshes that lie about in a detector's scenes and are not to be found
+    # folders of further meshes for a detector's scenes, which are not to be detected
     distractors: tuple[str, ...] = ()
     backgrounds: str = ""  # a folder of photographs
     init: str = ""  # weights to start from; empty = none

@@ -52,7 +52,7 @@ class DetectorConfig:
     """The training of a detector."""
 
     recipe: str = "detector"
-    agnostic: bool = False  # learn objects of any kind, procedural ones beside the given meshes
+    agnostic: bool = False  # detect objects of any kind, procedural ones beside the given meshes
     epochs: int = 10  # of ``epoch`` scenes each, where above 0; they give the steps
     epoch: int = 2000
     steps: int = 5000
@@ -208,6 +208,7 @@ class DetectorTask:
         self.module: nn.Module = DetectorModule(self.nets)
 
     def stream(self, start: int, rank: int) -> IterableDataset[Batch]:
+        """Process ``rank``'s batches from number ``start`` on."""
         return TabletopStream(self.config.stream, self.config.seed, self.sources.models, agnostic=self.config.agnostic,
                               photos=self.sources.photos, distractors=self.sources.distractors, start=start,
                               rank=rank)  # fmt: skip
@@ -227,12 +228,14 @@ class DetectorTask:
         return {"score": 1.0 - measured["mask_ap50"], **measured}
 
     def export(self, nets: nn.Module, out: Path, about: Mapping[str, Any]) -> None:
+        """Write ``out/detector.safetensors`` and ``.toml``; about: what the file says of the training."""
         own = self.sources.about(AGNOSTIC_SHARE if self.config.agnostic else 1.0)
         about = {**about, "version": __version__, "trained_on": f"composed scenes: {own}"}
         save_detector(out / "detector", self.config.network, nets, about)
 
     @cached_property
     def held_back(self) -> list[LabelledImage]:
+        """Composed scenes that are the same in every training of this seed, and never trained on."""
         rng = np.random.default_rng([HELD_BACK, self.config.seed])
         stream, renderer = self.config.stream, Renderer()
         scenes: list[LabelledImage] = []

@@ -30,6 +30,7 @@ class LiteModule(nn.Module):
         self.nets, self.config = nets, config
 
     def forward(self, batch: Batch, seed: int) -> tuple[Tensor, dict[str, Tensor]]:  # noqa: ARG002 - nothing is drawn
+        """The loss of a batch and its parts; ``seed`` is not used."""
         svnet = self.nets["svnet"]
         assert isinstance(svnet, LiteSVNet)
         output = svnet.predict(
@@ -65,11 +66,13 @@ class LiteTask(PoseTask):
         self.module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def stream(self, start: int, rank: int) -> IterableDataset[Batch]:
+        """Process ``rank``'s batches from number ``start`` on."""
         return PairStream(self.config.stream, self.config.seed, self.sources.photos, self.sources.models, start=start,
                           rank=rank)  # fmt: skip
 
     @property
     def measured(self) -> int:
+        """Batches that `prepare` measures: none where the networks are not new."""
         return -(-MEASURED // self.config.stream.batch) if self.fresh else 0
 
     def prepare(self, batches: Sequence[Batch]) -> None:

@@ -51,6 +51,7 @@ class Curves:
         return _rows(self.folder / f"{name}.csv")
 
     def close(self) -> None:
+        """Write what is still held and close the files."""
         self._writer.close()
 
     def _take_back(self, path: Path, step: int) -> None:

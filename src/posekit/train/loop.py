@@ -3,9 +3,9 @@
     with batches:  loss, backward, clip, step, average
     now and then:  log, validate, export, checkpoint
 
-Nothing random outlives a step: batch k is a function of (seed, k), and torch is seeded anew for each step. A checkpoint
-therefore needs the weights, their average, the optimiser's moments and the step's number, and a training that was
-killed ends as one that was not.
+No random state outlives a step: batch k is a function of (seed, k), and torch is seeded anew for each step. A
+checkpoint therefore needs the weights, their average, the optimiser's moments and the step's number, and a training
+that was killed ends as one that was not.
 """
 
 from __future__ import annotations
@@ -39,40 +39,67 @@ Batch = dict[str, Tensor]
 M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # malloc.h
 PROFILED = (3, 10)  # steps that --profile leaves out, and then records
 PATIENCE = 20  # steps in a row without a finite gradient that a GPU leaves out before the training ends
-SHOWN = 0.5  # seconds between two looks at the losses: a look waits for the GPU
+READ_EVERY = 0.5  # seconds between two reads of the losses: a read waits for the GPU
 
 
 class Schedule(Protocol):
     """What the loop needs to know of a training's configuration; `TrainConfig` says what each means."""
 
     @property
-    def recipe(self) -> str: ...
+    def recipe(self) -> str:
+        """What is trained: the name that checkpoints carry."""
+
     @property
-    def steps(self) -> int: ...
+    def steps(self) -> int:
+        """Steps of the whole training."""
+
     @property
-    def minutes(self) -> float: ...
+    def minutes(self) -> float:
+        """Wall-clock minutes after which it ends, if the steps have not ended it before; 0 = no limit."""
+
     @property
-    def seed(self) -> int: ...
+    def seed(self) -> int:
+        """Of all that is drawn at random."""
+
     @property
-    def validate(self) -> int: ...
+    def validate(self) -> int:
+        """Steps between validations."""
+
     @property
-    def export_seconds(self) -> float: ...
+    def export_seconds(self) -> float:
+        """Weights and a checkpoint are also written every so many seconds; 0 = not."""
+
     @property
-    def save(self) -> int: ...
+    def save(self) -> int:
+        """Steps between checkpoints."""
+
     @property
-    def log(self) -> int: ...
+    def log(self) -> int:
+        """Steps between rows of the log."""
+
     @property
-    def keep(self) -> int: ...
+    def keep(self) -> int:
+        """Checkpoints that are kept."""
+
     @property
-    def overfit(self) -> bool: ...
+    def overfit(self) -> bool:
+        """Whether every step sees the first batch."""
+
     @property
-    def profile(self) -> bool: ...
+    def profile(self) -> bool:
+        """Whether some steps are recorded by torch's profiler."""
+
     @property
-    def optimiser(self) -> OptimiserConfig: ...
+    def optimiser(self) -> OptimiserConfig:
+        """The optimiser and its rates."""
+
     @property
-    def machine(self) -> MachineConfig: ...
+    def machine(self) -> MachineConfig:
+        """What it runs on."""
+
     @property
-    def world(self) -> int: ...
+    def world(self) -> int:
+        """Processes in all."""
 
 
 class Task(Protocol):
@@ -83,10 +110,12 @@ class Task(Protocol):
     """
 
     @property
-    def nets(self) -> nn.Module: ...
+    def nets(self) -> nn.Module:
+        """The networks alone, whose weights are averaged and kept."""
 
     @property
-    def module(self) -> nn.Module: ...
+    def module(self) -> nn.Module:
+        """Has ``nets`` inside; from a batch and a seed to the loss and its parts."""
 
     def stream(self, start: int, rank: int) -> IterableDataset[Batch]:
         """Process ``rank``'s batches from number ``start`` on."""
@@ -149,7 +178,7 @@ def make_fabric(config: Schedule) -> Any:
         from lightning_fabric.plugins.environments.torchelastic import TorchElasticEnvironment
     except ImportError as error:
         raise ConfigError("training needs Lightning Fabric: pip install 'posekit[train]'.") from error
-    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # it tells every run what was asked for
+    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # it repeats the configuration in every run
     machine = config.machine
     accelerator = machine.accelerator
     if accelerator == "auto":
@@ -281,8 +310,8 @@ class Trainer:
     def train_step(self, batch: Batch, done: float, also: Mapping[str, float] | None = None) -> dict[str, Tensor]:
         """One optimiser step; returns the loss and its parts, detached scalars. also: further values to log.
 
-        On a GPU nothing in it waits for the device: a gradient that is not finite is left out there, and found out
-        about at the next look at the losses. On a CPU it ends the training. Raises TrainingError.
+        On a GPU nothing in it waits for the device: a gradient that is not finite is left out there, and noticed when
+        the losses are read next. On a CPU it ends the training. Raises TrainingError.
         """
         rank, world = self.fabric.global_rank, self.fabric.world_size
         drawn = 0 if self.config.overfit else self.step
@@ -311,6 +340,7 @@ class Trainer:
 
     @property
     def on_gpu(self) -> bool:
+        """Whether the training runs on a CUDA device without a loss scaler."""
         return bool(self.fabric.device.type == "cuda") and self.config.machine.precision != "16-mixed"
 
     def _check_finite(self, loss: float, norm: float) -> None:
@@ -341,8 +371,8 @@ class Trainer:
     def _now_and_then(self, curves: Curves) -> None:
         ended = self._share() >= 1
         logged = self.step % self.config.log == 0 or ended
-        if logged or self.seconds - self.shown >= SHOWN:
-            self._look(curves if logged else None)
+        if logged or self.seconds - self.shown >= READ_EVERY:
+            self._read_losses(curves if logged else None)
         self.score = math.nan
         due = 0 < self.config.export_seconds <= self.seconds - self.exported
         if self.step % self.config.validate == 0 or ended:
@@ -353,8 +383,8 @@ class Trainer:
             self.save()
             self.exported = self.seconds
 
-    def _look(self, curves: Curves | None) -> None:
-        """At the losses, which waits for the device."""
+    def _read_losses(self, curves: Curves | None) -> None:
+        """Read the losses, which waits for the device."""
         self.shown, means = self.seconds, self.means
         if self.running.failed is not None and float(self.running.failed) > PATIENCE:
             self._check_finite(math.nan, math.nan)

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from posekit.datasets.bop import BopDataset
 from posekit.estimate.refine import RefineOptions, refine
-from posekit.first_pose.mvnet import FirstPoseSearch, mvnet_search
+from posekit.first_pose.hypotheses import FirstPoseSearch
+from posekit.first_pose.mvnet import mvnet_search
 from posekit.geometry import Pose
 from posekit.mesh.model import ObjectModel
 from posekit.metrics import add, pose_error, within
-from posekit.nets.predictor import NetworkPredictor
+from posekit.nets.pytorch import NetworkPredictor
 from posekit.nets.weights import Networks
 from posekit.render import Renderer
 from posekit.results import Detection, Source
@@ -49,7 +50,8 @@ class Case:
 @dataclass(frozen=True, eq=False)
 class CaseSource:
     """What renderings for cases are made of. models: in turn; none = new procedural objects. unlike, deformed: the
-    shares of cases whose mesh looks other than the object that is shown, or strays from it (`appearance.variants`)."""
+    shares of cases whose mesh has other colours than the object that is shown, or another shape
+    (`appearance.variants`)."""
 
     models: Sequence[ObjectModel]
     photos: Sequence[NDArray[np.uint8]]

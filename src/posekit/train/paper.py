@@ -1,7 +1,7 @@
 """The paper's recipe: MV-Net and SV-Net trained together, end to end (section 3.4, equations 1 and 2).
 
-MV-Net's first estimate renders SV-Net's first sample, each of SV-Net's answers the next one, detached: SV-Net learns to
-mend what the networks get wrong. Where a first estimate is more than 25 degrees off, a sample with a small random
+MV-Net's first estimate renders SV-Net's first sample, each of SV-Net's outputs the next one, detached: SV-Net learns
+to correct what the networks get wrong. Where a first estimate is more than 25 degrees off, a sample with a small random
 rotation takes its place.
 """
 
@@ -70,6 +70,7 @@ class PaperModule(nn.Module):
         self._frontals: dict[int, tuple[Frontal, Tensor]] = {}
 
     def forward(self, batch: Batch, seed: int) -> tuple[Tensor, dict[str, float]]:
+        """The loss of a batch and its parts; seed: of the poses that are drawn."""
         svnet, mvnet = self.nets["svnet"], self.nets["mvnet"]
         assert isinstance(svnet, PaperSVNet) and isinstance(mvnet, PaperMVNet)
         rng = np.random.default_rng(seed)
@@ -130,7 +131,7 @@ class PaperModule(nn.Module):
         return replace(crop, observed=rgba_of(observed), rendered=rgba_of(drawn))
 
     def _next(self, scene: _Scene, crop: _Crop, delta: PoseDelta, rng: np.random.Generator) -> Pose:
-        """The next iteration's start: the answer, turned back into the scene's frame, unless it is lost."""
+        """The next iteration's start: the output, turned back into the scene's frame, unless it is lost."""
         updated = apply_delta(crop.source, delta, crop.zoom.camera.fx)
         found = Pose.rotation(crop.zoom.R_view_cam.T) @ updated
         return found if is_near(found, scene, np.pi) else disturbed_pose(scene.truth, scene.model.diameter, rng)
@@ -198,11 +199,13 @@ class PaperTask(PoseTask):
         self.module: nn.Module = PaperModule(self.nets, catalogue.models, networks.size, config.paper.views)
 
     def stream(self, start: int, rank: int) -> IterableDataset[Batch]:
+        """Process ``rank``'s batches from number ``start`` on."""
         return SceneStream(self.config.stream, self.config.seed, self.catalogue, self.sources.photos, start=start,
                            rank=rank)  # fmt: skip
 
     @property
     def measured(self) -> int:
+        """Batches that `prepare` measures: none where the networks are not new."""
         return MEASURED if self.fresh else 0
 
     def prepare(self, batches: Sequence[Batch]) -> None:

@@ -16,7 +16,8 @@ from torch import Tensor
 from posekit._version import __version__
 from posekit.errors import ConfigError, OutputError, WeightsError
 from posekit.io.files import write_text_atomic
-from posekit.nets.lite import LiteConfig, LiteSVNet
+from posekit.nets.config import LiteConfig
+from posekit.nets.lite import LiteSVNet
 from posekit.nets.mvnet import MatchingMVNet
 from posekit.nets.weights import Networks, build, load_networks, save_networks
 from posekit.render import Renderer
@@ -192,6 +193,8 @@ def is_first() -> bool:
 
 
 def claim(out: Path, force: bool) -> None:
+    """Make ``out`` ready for a new training; force: delete a former one's checkpoints and logs there. Raises
+    OutputError where it is a file, or holds files and ``force`` is not given."""
     if out.exists() and not out.is_dir():
         raise OutputError(f"{out} is a file: --out names a folder.")
     if out.is_dir() and any(out.iterdir()):

@@ -1,4 +1,4 @@
-"""What a training is fed with, read from where its configuration says."""
+"""What a training learns from, read from where its configuration says."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def _meshes(folder: Path, units: str) -> list[ObjectModel]:
 
 
 def _loaded(path: Path, units: str) -> ObjectModel | None:
-    """A mesh of a folder; None where it cannot be used, which is told: it shall not end a training on a thousand."""
+    """A mesh of a folder; None where it cannot be used, which is logged: one of a thousand must not end a training."""
     try:
         return _light(ObjectModel.load(path, units=units))
     except MeshError as error:

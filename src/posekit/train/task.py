@@ -38,6 +38,7 @@ class PoseTask:
         self.fresh = fresh & set(nets)
 
     def heads(self, name: str) -> PoseHeads:
+        """The pose heads of network ``name``, "svnet" or "mvnet"."""
         heads = self.nets[name].heads
         assert isinstance(heads, PoseHeads)
         return heads
@@ -52,6 +53,7 @@ class PoseTask:
         return {"score": found.get("bop_add", found.get("add", 0.0)), **found}
 
     def export(self, nets: nn.Module, out: Path, about: Mapping[str, Any]) -> None:
+        """Write the networks with ``about``, what was seen and what they were trained on."""
         before = self.networks.about  # of the weights that the training started from, where it did
         own = self.sources.about(self.config.stream.share)
         trained_on = f"{before['trained_on']}; then {own}" if before.get("trained_on") else own
@@ -66,16 +68,19 @@ class PoseTask:
 
     @cached_property
     def renderer(self) -> Renderer:
+        """Made when it is first asked for."""
         return Renderer()
 
     @cached_property
     def cases(self) -> list[Case]:
+        """Held-back renderings to measure on."""
         stream = self.config.stream
         source = CaseSource(self.models, self.sources.photos, stream.scenes, stream.augment)
         return rendered_cases(source, self.renderer, self.config.cases)
 
     @cached_property
     def bop(self) -> list[Case]:
+        """Cases of the data set to validate on, none without one. Raises ConfigError where it shows none."""
         held = self.sources.validation
         if held is None or not self.config.cases:
             return []

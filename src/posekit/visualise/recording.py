@@ -1,4 +1,4 @@
-"""A recording of a track for the Rerun viewer. The only door to rerun., which comes as an extra."""
+"""A recording of a track for the Rerun viewer. The only module that imports rerun, which comes as an extra."""
 
 from __future__ import annotations
 
@@ -78,11 +78,11 @@ class Recorder:
         return f"objects/{k}-{self.models[k].name}"
 
     def _mesh(self, model: ObjectModel) -> Any:
-        look: dict[str, Any] = {"vertex_colors": model.colors}
+        surface: dict[str, Any] = {"vertex_colors": model.colors}
         if model.texture is not None and model.uvs is not None:
             down = np.stack([model.uvs[:, 0], 1 - model.uvs[:, 1]], axis=1)
-            look = {"vertex_texcoords": down, "albedo_texture": model.texture}
-        return self._rr.Mesh3D(vertex_positions=model.vertices, triangle_indices=model.faces, **look)
+            surface = {"vertex_texcoords": down, "albedo_texture": model.texture}
+        return self._rr.Mesh3D(vertex_positions=model.vertices, triangle_indices=model.faces, **surface)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from posekit.camera import box_mask
 from posekit.synth.procedural import noise_image, photo_crop, random_colour
 from posekit.train.data.pairs import ANCHOR, Pair
 
@@ -37,7 +38,7 @@ class AugmentConfig:
     no_mask: float = 0.15
     box_mask: float = 0.12
     cut_mask: float = 0.08
-    tone: float = 1.0  # how far exposure, contrast and white balance stray, 0 = not at all
+    tone: float = 1.0  # strength of changes of exposure, contrast and white balance, 0 = none
     # share of pictures with one of MegaPose's stronger changes: little or much contrast, brightness or colour, grey,
     # sharpened
     harsh: float = 0.35
@@ -134,12 +135,12 @@ def _at_anchors(hidden: NDArray[np.bool_], pair: Pair) -> NDArray[np.bool_]:
     """``hidden`` (H, W) looked up where each anchor's surface point lies in the target, (h, w)."""
     h, w = pair.valid.shape
     H, W = hidden.shape
-    place = np.rint(_home(h, w) + pair.flow).astype(int)
+    place = np.rint(_anchor_pixels(h, w) + pair.flow).astype(int)
     return hidden[place[..., 1].clip(0, H - 1), place[..., 0].clip(0, W - 1)]
 
 
 @cache
-def _home(h: int, w: int) -> NDArray[np.int64]:
+def _anchor_pixels(h: int, w: int) -> NDArray[np.int64]:
     """The anchors' pixels (h, w, 2)."""
     return np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1) * ANCHOR + 2
 
@@ -211,7 +212,7 @@ def _photograph(scene: Image, config: AugmentConfig, rng: Rng) -> Image:
     if rng.random() < 0.8:
         x = _mapped(x, 255 * _tone(LEVELS / 255, config.tone, rng))
     if rng.random() < config.harsh:
-        x = _harsh(x, rng)
+        x = _strong_change(x, rng)
     if rng.random() < 0.4:
         x = cv2.GaussianBlur(x, (0, 0), float(rng.uniform(0.4, 1.8)))
     if rng.random() < 0.12:
@@ -230,7 +231,8 @@ def _photograph(scene: Image, config: AugmentConfig, rng: Rng) -> Image:
 
 
 def _tone(levels: NDArray[np.float64], tone: float, rng: Rng) -> NDArray[np.float64]:
-    """Gamma, white balance, exposure, contrast and offset of levels (256, 3) in 0..1; tone: how far they stray."""
+    """Gamma, white balance, exposure, contrast and offset of levels (256, 3) in 0..1; tone: how strong the changes
+    are."""
     x = levels ** np.exp(rng.normal() * 0.2 * tone)
     x = x * np.exp((rng.normal(size=3) * 0.07 + rng.normal() * 0.18) * tone)
     return np.asarray((x - 0.5) * rng.uniform(0.75, 1.2) ** tone + 0.5 + rng.normal() * 0.04 * tone)
@@ -249,7 +251,7 @@ def _noise_bank(height: int, width: int) -> NDArray[np.float32]:
     return np.random.default_rng(0).standard_normal((height, width, 3), dtype=np.float32)
 
 
-def _harsh(x: Image, rng: Rng) -> Image:
+def _strong_change(x: Image, rng: Rng) -> Image:
     """One strong change of contrast, brightness or colour, or a sharpened picture."""
     kind = int(rng.integers(5))
     if kind == 0:
@@ -281,9 +283,8 @@ def disturb_mask(mask: NDArray[np.bool_], config: AugmentConfig, rng: Rng) -> ND
         return np.zeros_like(mask)
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     if kind < config.no_mask + config.box_mask:
-        box = np.zeros_like(mask)
-        box[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] = True
-        return box
+        box = float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1)
+        return box_mask(box, (mask.shape[1], mask.shape[0]))
     out: Image = mask.astype(np.uint8)
     if kind < config.no_mask + config.box_mask + config.cut_mask:
         centre = [int(rng.choice(columns)), int(rng.choice(rows))]
@@ -299,10 +300,10 @@ def disturb_mask(mask: NDArray[np.bool_], config: AugmentConfig, rng: Rng) -> ND
 
 
 def _resize_mask(mask: Image, config: AugmentConfig, rng: Rng) -> Image:
-    """A mask (H, W) grown or worn off by a few pixels; one that would vanish stays."""
+    """A mask (H, W) dilated or eroded by a few pixels; one that would vanish stays."""
     radius = int(rng.integers(0, config.dilate // 2 + 1)) if rng.random() < 0.4 else int(rng.integers(0, 2))
     kernel = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
     if rng.random() < config.grown:
         return cv2.dilate(mask, kernel).astype(np.uint8)
-    worn = cv2.erode(mask, kernel).astype(np.uint8)
-    return worn if worn.sum() > 0.4 * mask.sum() else mask
+    eroded = cv2.erode(mask, kernel).astype(np.uint8)
+    return eroded if eroded.sum() > 0.4 * mask.sum() else mask

@@ -20,7 +20,7 @@ from posekit.render import Renderer
 from posekit.train.data.augment import observe, observe_photo
 from posekit.train.data.crops import BoxSample, Frontal, Scene, SceneConfig, box_sample, photo_scene, render_scenes
 from posekit.train.data.crops import usable_instances as usable
-from posekit.train.data.stream import BATCHES, SCENES, Batch, StreamConfig, window, worker_lane
+from posekit.train.data.stream import BATCHES, SCENES, Batch, StreamConfig, window, worker_position
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,26 +80,26 @@ class SceneStream(IterableDataset[Batch]):
         self.start, self.rank = start, rank
 
     def __iter__(self) -> Iterator[Batch]:
-        first, lanes = worker_lane(self.start)
+        first, workers = worker_position(self.start)
         count, renderer = self.config.shards, Renderer()
-        shards = [_Shard(self, first % lanes, self.rank * count + i, renderer) for i in range(count)]
-        for k in itertools.count(first, lanes):
-            yield _collate([drawn for shard in shards for drawn in shard.draw(k, lanes)])
+        shards = [_Shard(self, first % workers, self.rank * count + i, renderer) for i in range(count)]
+        for k in itertools.count(first, workers):
+            yield _collate([drawn for shard in shards for drawn in shard.draw(k, workers)])
 
 
 Drawn = tuple[int, Scene, NDArray[np.uint8], BoxSample]
 
 
 class _Shard:
-    def __init__(self, stream: SceneStream, lane: int, shard: int, renderer: Renderer) -> None:
-        self.stream, self.config, self.lane, self.shard = stream, stream.config, lane, shard
+    def __init__(self, stream: SceneStream, worker: int, shard: int, renderer: Renderer) -> None:
+        self.stream, self.config, self.worker, self.shard = stream, stream.config, worker, shard
         self.renderer = renderer
         self.blocks = window(self._block, self.config, self.config.batch // self.config.shards)
         self.frontals: dict[int, Frontal] = {}
 
     def _block(self, number: int) -> list[tuple[int, Scene]]:
         """Renderings of one object, or photographs of several."""
-        rng = np.random.default_rng([self.stream.seed, SCENES, self.lane, self.shard, number])
+        rng = np.random.default_rng([self.stream.seed, SCENES, self.worker, self.shard, number])
         catalogue, config = self.stream.catalogue, self.config
         weights = np.array(catalogue.weights)
         source = int(rng.choice(len(weights), p=weights / weights.sum()))
@@ -112,10 +112,10 @@ class _Shard:
         found = [(photos.numbers[i.obj_id], photo_scene(photos.dataset, i, config.scenes, rng)) for i in chosen]
         return [(k, scene) for k, scene in found if scene is not None]
 
-    def draw(self, k: int, lanes: int) -> list[Drawn]:
+    def draw(self, k: int, workers: int) -> list[Drawn]:
         """This shard of batch k."""
         rng = np.random.default_rng([self.stream.seed, BATCHES, k, self.shard])
-        pool = [pair for block in self.blocks.at(k // lanes) for pair in block]
+        pool = [pair for block in self.blocks.at(k // workers) for pair in block]
         if not pool:
             raise ConfigError("none of the objects is seen in its own training scenes: are the meshes or masks empty?")
         chosen = rng.integers(len(pool), size=self.config.batch // self.config.shards)

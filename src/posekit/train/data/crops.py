@@ -32,7 +32,7 @@ class SceneConfig:
 
     crop: tuple[int, int] = (160, 120)  # (width, height) of the networks' crops
     oversize: float = 1.5  # how much larger a scene's picture is
-    margin: tuple[float, float] = (1.5, 2.2)  # how much wider than the object it looks
+    margin: tuple[float, float] = (1.5, 2.2)  # width of its view in widths of the object
     distance: tuple[float, float] = (3.0, 14.0)  # range in diameters
     shift: float = 0.3  # how far from the middle the object may lie, in its own half widths
     # box_shift, box_scale: standard deviations of a detection box's error, in its own size
@@ -77,7 +77,7 @@ class Frontal:
 
 @dataclass(frozen=True, eq=False)
 class BoxSample:
-    """What MV-Net is given and should answer. observed: uint8 (H, W, 4), the crop round a detection's box. camera:
+    """MV-Net's input and its target. observed: uint8 (H, W, 4), the crop round a detection's box. camera:
     the crop's. R_crop_view: (3, 3), from the scene's frame into the crop's. delta: from the frontal view to the
     truth."""
 

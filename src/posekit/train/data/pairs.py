@@ -1,7 +1,7 @@
 """Training pairs: an object rendered at its true pose and at a disturbed one, in the same zoomed view.
 
 A zoomed view's camera is turned so that the source pose's centre lies on its axis (see ``zoom``), therefore
-the photograph's camera need not be simulated: wherever in a photograph the object was, the pair looks so.
+the photograph's camera need not be simulated: wherever in a photograph the object was, the pair is the same.
 """
 
 from __future__ import annotations
@@ -171,20 +171,14 @@ def true_flow(
     points = T_view_obj.apply(coords)
     points[..., 2] = np.maximum(points[..., 2], 1e-3)
     place = camera.project(points)
-    home = np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1) * ANCHOR + 2
+    anchors = np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1) * ANCHOR + 2
     column = np.clip(np.rint(place[..., 0]), 0, camera.width - 1).astype(int)
     row = np.clip(np.rint(place[..., 1]), 0, camera.height - 1).astype(int)
     inside = (np.abs(place[..., 0] - column) <= 0.5) & (np.abs(place[..., 1] - row) <= 0.5)
     found = depth[row, column]
     seen = valid & inside & (found > 0) & (np.abs(found - points[..., 2]) < tolerance)
-    return (place - home).astype(np.float32), seen
+    return (place - anchors).astype(np.float32), seen
 
 
 def _rgba(image: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
     return np.dstack([image, mask.astype(np.uint8) * 255])
-
-
-def stack_statistics(pairs: Sequence[Pair]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """quat_wxyz (N, 4) and v (N, 3) of the pairs that are not lost."""
-    kept = [p for p in pairs if not p.lost]
-    return np.stack([p.quat_wxyz for p in kept]), np.stack([p.v for p in kept])

@@ -120,14 +120,15 @@ def window(make: Callable[[int], T], config: StreamConfig, drawn: int) -> Window
 
 
 class Source:
-    """The objects of one lane and shard: the user's meshes, or procedural ones, always new."""
+    """The objects of one worker and shard: the user's meshes, or procedural ones, always new."""
 
-    def __init__(self, stream: PairStream, lane: int, shard: int) -> None:
-        self.stream, self.lane, self.shard = stream, lane, shard
+    def __init__(self, stream: PairStream, worker: int, shard: int) -> None:
+        self.stream, self.worker, self.shard = stream, worker, shard
         self._last: tuple[tuple[int, int], ObjectModel] | None = None
 
     def rng(self, purpose: int, k: int) -> np.random.Generator:
-        return np.random.default_rng([self.stream.seed, purpose, self.lane, self.shard, k])
+        """The generator of ``purpose`` and number k, the same in every run."""
+        return np.random.default_rng([self.stream.seed, purpose, self.worker, self.shard, k])
 
     def object(self, purpose: int, block: int) -> ObjectModel:
         """What block number ``block`` shows; the last one is kept, because the next block often shows it too."""
@@ -135,7 +136,7 @@ class Source:
         if self._last is None or self._last[0] != key:
             self._last = (
                 key,
-                self._make(np.random.default_rng([self.stream.seed, OBJECTS, self.lane, self.shard, *key])),
+                self._make(np.random.default_rng([self.stream.seed, OBJECTS, self.worker, self.shard, *key])),
             )
         return self._last[1]
 
@@ -147,13 +148,13 @@ class Source:
 
 
 class _Shard:
-    """What one lane draws a shard of each of its batches from."""
+    """What one worker draws a shard of each of its batches from."""
 
-    def __init__(self, stream: PairStream, lane: int, shard: int, renderer: Renderer) -> None:
+    def __init__(self, stream: PairStream, worker: int, shard: int, renderer: Renderer) -> None:
         self.stream, self.config, self.shard, self.renderer = stream, stream.config, shard, renderer
-        self.source = Source(stream, lane, shard)
+        self.source = Source(stream, worker, shard)
         self.pairs = window(self._pairs, self.config, self.config.batch // self.config.shards)
-        self.for_queries = Source(stream, lane, shard)
+        self.for_queries = Source(stream, worker, shard)
         self.queries = replace(self.config.queries, queries=self.config.mvnet // self.config.shards)
         per_batch = self.queries.queries / self.config.reuse / self.config.per_object
         self.meshes = Window(self._mesh, QUERIED // 4, QUERIED, per_batch)
@@ -167,21 +168,21 @@ class _Shard:
         scenes = render_queries(self.renderer, model, self.config.per_object, self.queries, rng)
         return training_bank(model, self.renderer, self.queries, rng, scenes), scenes
 
-    def draw_queries(self, k: int, lanes: int) -> QueryGroup:
+    def draw_queries(self, k: int, workers: int) -> QueryGroup:
         """This shard's queries of batch k, of one mesh."""
         rng = np.random.default_rng([self.stream.seed, QUERIES, k, self.shard])
-        meshes = self.meshes.at(k // lanes)
+        meshes = self.meshes.at(k // workers)
         chosen = int(rng.integers(len(meshes)))
         bank, scenes = meshes[chosen]
         strange = [scene for n, (_, found) in enumerate(meshes) if n != chosen for scene in found]
         others = [scene.rgba for scene in [*scenes, *strange]]
         return draw_queries(bank, scenes, others, self.stream.photos, self.queries, rng, strange, self.config.augment)
 
-    def draw(self, k: int, lanes: int) -> list[Sample]:
+    def draw(self, k: int, workers: int) -> list[Sample]:
         """This shard of batch k."""
         config, photos = self.config, self.stream.photos
         rng = np.random.default_rng([self.stream.seed, BATCHES, k, self.shard])
-        pool = [pair for block in self.pairs.at(k // lanes) for pair in block]
+        pool = [pair for block in self.pairs.at(k // workers) for pair in block]
         chosen = rng.integers(len(pool), size=config.batch // config.shards)
         return [augment(pool[i], pool, photos, config.augment, rng) for i in chosen]
 
@@ -199,19 +200,19 @@ class PairStream(IterableDataset[Batch]):
         self.start, self.rank = start, rank
 
     def __iter__(self) -> Iterator[Batch]:
-        first, lanes = worker_lane(self.start)
+        first, workers = worker_position(self.start)
         renderer, count = Renderer(), self.config.shards
-        shards = [_Shard(self, first % lanes, self.rank * count + i, renderer) for i in range(count)]
-        for k in itertools.count(first, lanes):
-            batch = collate([sample for shard in shards for sample in shard.draw(k, lanes)])
+        shards = [_Shard(self, first % workers, self.rank * count + i, renderer) for i in range(count)]
+        for k in itertools.count(first, workers):
+            batch = collate([sample for shard in shards for sample in shard.draw(k, workers)])
             if self.config.mvnet:
-                batch |= collate_queries([shard.draw_queries(k, lanes) for shard in shards])
+                batch |= collate_queries([shard.draw_queries(k, workers) for shard in shards])
             yield batch
 
 
-def worker_lane(start: int) -> tuple[int, int]:
-    """The first batch of this worker process, and how many workers there are. A batch's number and theirs say which
-    lane of data it comes from, whichever worker makes it."""
+def worker_position(start: int) -> tuple[int, int]:
+    """The first batch of this worker process, and how many workers there are. A batch's number modulo theirs says
+    whose random numbers it is drawn with, whichever process makes it."""
     info = get_worker_info()
     if info is None:
         return start, 1

@@ -16,7 +16,7 @@ from posekit.mesh.model import ObjectModel
 from posekit.render import Renderer
 from posekit.synth.tabletop import TabletopConfig, compose, procedural_objects, resized
 from posekit.train.data.augment import AugmentConfig, observe_photo
-from posekit.train.data.stream import BATCHES, OBJECTS, SCENES, Batch, Window, worker_lane
+from posekit.train.data.stream import BATCHES, OBJECTS, SCENES, Batch, Window, worker_position
 
 Image = NDArray[np.uint8]
 Rng = np.random.Generator
@@ -101,19 +101,19 @@ class TabletopStream(IterableDataset[Batch]):
         self.photos, self.start, self.rank = photos, start, rank
 
     def __iter__(self) -> Iterator[Batch]:
-        first, lanes = worker_lane(self.start)
-        config, lane, renderer = self.config, first % lanes, Renderer()
+        first, workers = worker_position(self.start)
+        config, worker, renderer = self.config, first % workers, Renderer()
 
         def block(number: int) -> list[LabelledImage]:
-            rng = np.random.default_rng([self.seed, SCENES, OBJECTS, self.rank, lane, number])
+            rng = np.random.default_rng([self.seed, SCENES, OBJECTS, self.rank, worker, number])
             return labelled_scenes(renderer, self.models, self.agnostic, config.per_block, config, rng, self.photos,
                                    self.distractors)  # fmt: skip
 
         most = max(1, config.pool // config.per_block)
         blocks = Window(block, max(1, most // 4), most, config.batch / config.reuse / config.per_block)
-        for k in itertools.count(first, lanes):
+        for k in itertools.count(first, workers):
             rng = np.random.default_rng([self.seed, BATCHES, self.rank, k])
-            pool = [scene for each in blocks.at(k // lanes) for scene in each]
+            pool = [scene for each in blocks.at(k // workers) for scene in each]
             chosen = rng.integers(len(pool), size=config.batch)
             yield collate([photographed(pool[int(i)], config.augment, rng) for i in chosen])
 

@@ -22,7 +22,7 @@ from posekit.geometry import Pose, fibonacci_sphere, random_rotation, rotation_b
 from posekit.mesh.model import ObjectModel
 from posekit.nets.mvnet import CELL, GRID, NONE
 from posekit.render import Renderer
-from posekit.synth.appearance import FADED, faded
+from posekit.synth.appearance import WASHED_OUT, washed_out
 from posekit.synth.light import random_light
 from posekit.train.data.augment import AugmentConfig, composed
 from posekit.zoom import zoom_to_box
@@ -79,7 +79,7 @@ class QueryScene:
 
 @dataclass(frozen=True, eq=False)
 class QuerySample:
-    """A query and its answers for k templates of a group of K. observed: uint8 (H, W, 3). chosen: int64 (k,), in the
+    """A query and its targets for k templates of a group of K. observed: uint8 (H, W, 3). chosen: int64 (k,), in the
     group. cell: int64 (k, h * w), 64 = none. offset: float32 (k, 2, h * w), from the cell's middle in cells. turn:
     float32 (k, 2), cosine and sine of the turn in the picture from template to query. facing: (k,), cosine between
     directions of view. near: (k,) and near_all: (K,), 1 = the template is the truth. silhouettes: bool (2, H/4, W/4),
@@ -112,11 +112,11 @@ def training_bank(
 
     around: where given, only config.drawn of the directions are drawn, those nearest to the scenes' first.
     """
-    look = faded(model, str(rng.choice(FADED)), rng) if rng.random() < config.plain else model
+    coloured = washed_out(model, str(rng.choice(WASHED_OUT)), rng) if rng.random() < config.plain else model
     directions = fibonacci_sphere(config.views)
     if len(around):
         directions = directions[_near_directions(directions, around, config, rng)]
-    return ViewBank.of(model, renderer, directions, look)
+    return ViewBank.of(model, renderer, directions, coloured)
 
 
 def _near_directions(
@@ -154,7 +154,7 @@ def render_queries(
     renderer: Renderer, model: ObjectModel, count: int, config: QueryConfig, rng: Rng
 ) -> list[QueryScene]:
     """At most ``count`` crops of an object from all sides; those in which hardly anything is seen are left out."""
-    look = faded(model, str(rng.choice(FADED)), rng) if rng.random() < config.plain_scene else model
+    coloured = washed_out(model, str(rng.choice(WASHED_OUT)), rng) if rng.random() < config.plain_scene else model
     whole = Camera.from_fov(0.8, 640, 480)
     outline = model.hull_ctr
     poses, cameras = [], []
@@ -167,7 +167,7 @@ def render_queries(
         cameras.append(zoom.camera)
     T_ctr_obj = model.T_ctr_obj
     placed = [pose @ T_ctr_obj for pose in poses]
-    drawn = renderer.render(look, placed, cameras, light=[random_light(rng) for _ in range(count)], coords=False)
+    drawn = renderer.render(coloured, placed, cameras, light=[random_light(rng) for _ in range(count)], coords=False)
     h, w = config.cells
     cells = renderer.render(model, placed, [c.resized(w, h) for c in cameras], rgb=False)
     scenes = []
@@ -194,6 +194,7 @@ class Relation:
 
     @classmethod
     def of(cls, R_query: Array, R_templates: Array, config: QueryConfig) -> Relation:
+        """From rotations ``R_cam_obj`` of a query (3, 3) and of K templates (K, 3, 3)."""
         between = R_query @ R_templates.transpose(0, 2, 1)
         turn = np.stack([between[:, 0, 0] + between[:, 1, 1], between[:, 1, 0] - between[:, 0, 1]], axis=1)
         turn /= np.linalg.norm(turn, axis=1, keepdims=True).clip(1e-9)
