@@ -404,6 +404,16 @@ def test_doctor_fails_where_something_essential_is_missing(monkeypatch: pytest.M
     assert "-> apt-get install it" in result.stdout
 
 
+def test_doctor_says_where_torchs_cuda_build_is_of_no_use(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.version, "cuda", "12.8")
+    [finding] = doctor._torch()
+    assert finding.state == "note" and "--index-url https://download.pytorch.org/whl/cpu" in finding.todo
+    monkeypatch.setattr(torch.version, "cuda", None)
+    [finding] = doctor._torch()
+    assert finding.state == "ok"
+
+
 def test_doctor_names_opengl_that_does_not_work() -> None:
     result = python("-m", "posekit", "doctor", env={**os.environ, "POSEKIT_GL": "nonsense"})
     assert result.returncode == 1

@@ -10,10 +10,21 @@ import numpy as np
 import pytest
 import yaml
 
+from posekit.camera import Camera
 from posekit.errors import ConfigError, PromptError
 from posekit.geometry import Pose, quat_to_rotation, random_rotation
 from posekit.io.load import load_pose
-from posekit.io.pose_formats import FORMATS, UNITY_MESH, NamedPose, pose_files, pose_from_text, to_blender, to_unity
+from posekit.io.pose_formats import (
+    FORMATS,
+    UNITY_MESH,
+    NamedPose,
+    opengl_projection,
+    pose_files,
+    pose_from_text,
+    to_blender,
+    to_opengl,
+    to_unity,
+)
 
 RNG = np.random.default_rng(4)
 POSE = Pose(random_rotation(RNG), [0.1, -0.2, 0.9])
@@ -71,6 +82,24 @@ def test_unity_is_left_handed_with_y_up_and_meshes_negated_in_x() -> None:
     assert entry["localPosition"] == {"x": 0.1, "y": 0.2, "z": 0.9}
     turned = quat_to_rotation([entry["localRotation"][k] for k in "wxyz"])
     np.testing.assert_allclose(turned, there.R, atol=1e-12)
+
+
+def test_opengl_shows_points_where_the_camera_does() -> None:
+    camera = Camera(610.0, 604.0, 322.0, 236.0, 640, 480)
+    points = 0.05 * RNG.normal(size=(20, 3))
+    matrix = opengl_projection(camera, 0.2, 5.0) @ to_opengl(POSE).matrix
+    clip = np.concatenate([points, np.ones((20, 1))], axis=1) @ matrix.T
+    ndc = clip[:, :3] / clip[:, 3:]
+    window = (ndc[:, :2] * (1, -1) + 1) / 2 * (640, 480)  # edges; the first row at the top, as y is up
+    np.testing.assert_allclose(window - 0.5, camera.project(POSE.apply(points)), atol=1e-9)
+    depths = clip[:, 3]
+    np.testing.assert_allclose(depths, POSE.apply(points)[:, 2], atol=1e-12)
+    assert (np.abs(ndc[:, 2]) < 1).all() and np.corrcoef(ndc[:, 2], depths)[0, 1] > 0, "nearer is smaller"
+
+
+def test_opengl_wants_planes_in_front_of_the_camera() -> None:
+    with pytest.raises(ConfigError, match="0 < near < far"):
+        opengl_projection(Camera(610, 610, 322, 236, 640, 480), 5.0, 0.2)
 
 
 def test_tum_is_one_trajectory_for_each_object_and_can_be_read_again(tmp_path: Path) -> None:

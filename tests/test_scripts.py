@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import shutil
 import subprocess
 import sys
@@ -12,7 +13,9 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-SCRIPTS = [ROOT / "scripts" / name for name in ("setup", "demo", "test", "check", "pictures")] + [ROOT / ".ci" / "run"]
+SCRIPTS = [ROOT / "scripts" / name for name in ("setup", "demo", "test", "check", "pictures", "docs")] + [
+    ROOT / ".ci" / "run"
+]
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.name)
@@ -41,12 +44,14 @@ def run(tree: Path, path: Path, cwd: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
-def fake_venv(tree: Path, pip: str) -> None:
-    """A .venv whose python runs everything but pip's install, in whose place ``pip`` (bash) runs."""
+def fake_venv(tree: Path, pip: str, index: str = "exit 1") -> None:
+    """A .venv whose python runs everything but pip's install and index, in whose places ``pip`` and ``index`` (bash)
+    run."""
     python = tree / ".venv/bin/python"
     python.parent.mkdir(parents=True)
     python.write_text(
-        f'#!/usr/bin/env bash\ncase "$*" in *"pip install"*) {pip} ;; *) exec {sys.executable} "$@" ;; esac\n'
+        f'#!/usr/bin/env bash\ncase "$*" in *"pip install"*) {pip} ;; *"pip index"*) {index} ;;\n'
+        f'*) exec {sys.executable} "$@" ;; esac\n'
     )
     python.chmod(0o755)
 
@@ -68,6 +73,21 @@ def test_setup_installs_once(tree: Path, tmp_path: Path) -> None:
         file.write("# changed\n")
     assert run(tree, tmp_path, tmp_path).returncode == 0
     assert (tmp_path / "calls").read_text().count("\n") == 2
+
+
+NO_GPU = platform.machine() == "x86_64" and not Path("/proc/driver/nvidia").exists() and not shutil.which("nvidia-smi")
+
+
+@pytest.mark.skipif(sys.platform != "linux" or not NO_GPU, reason="elsewhere the usual build of torch is right")
+@pytest.mark.parametrize(("offered", "apart"), [("2.13.0+cpu, 2.12.1+cpu", True), ("2.13.0", False)])
+def test_setup_takes_torch_without_cuda_where_it_is_offered(
+    tree: Path, tmp_path: Path, offered: str, apart: bool
+) -> None:
+    fake_venv(tree, f'echo "$*" >> "{tmp_path}/calls"', f'echo "Available versions: {offered}"')
+    assert run(tree, tmp_path, tmp_path).returncode == 0
+    *torch, everything = (tmp_path / "calls").read_text().splitlines()
+    assert len(torch) == apart and all("torch torchvision --index-url https://" in call for call in torch)
+    assert "-e .[" in everything and "index-url" not in everything
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the scripts install system libraries on Linux")
@@ -93,5 +113,5 @@ def test_setup_says_that_python_is_too_old(tree: Path, tmp_path: Path) -> None:
 def test_constraints_lie_within_the_ranges() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     pinned = [line for line in (ROOT / "scripts/constraints.txt").read_text().splitlines() if "==" in line]
-    assert {line.split("==")[0] for line in pinned} >= {"torch", "torchvision", "viser"}
+    assert {line.split("==")[0] for line in pinned} >= {"torch", "torchvision", "viser", "mkdocs-material"}
     assert not any("==" in dependency for dependency in project["dependencies"])

@@ -27,6 +27,7 @@ class Finding:
     todo: str = ""
 
 
+CPU_INDEX = "https://download.pytorch.org/whl/cpu"  # PyTorch's own, of builds without CUDA
 _STYLES = {"ok": "green", "note": "yellow", "problem": "bold red"}
 
 
@@ -86,7 +87,11 @@ def _torch() -> list[Finding]:
     except (ImportError, OSError) as error:
         return [Finding("torch", f"cannot be imported: {error}", "problem", _reinstall("torch torchvision"))]
     device = torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU"
-    return [Finding("torch", f"{torch.__version__}, {torch.get_num_threads()} threads, {device}")]
+    text = f"{torch.__version__}, {torch.get_num_threads()} threads, {device}"
+    if torch.version.cuda is None or torch.cuda.is_available():
+        return [Finding("torch", text)]
+    todo = f"In a new environment: pip install torch torchvision --index-url {CPU_INDEX}, then posekit."
+    return [Finding("torch", f"{text}; a build for NVIDIA GPUs, none is usable here: 4 GB too much", "note", todo)]
 
 
 def _openvino() -> list[Finding]:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from posekit.camera import Camera
 from posekit.errors import ConfigError
 from posekit.geometry import Pose, quat_to_rotation
 
@@ -34,9 +35,9 @@ CSV_COLUMNS = [
     "reliable",
 ]
 ROS_FRAME = "camera_optical_frame"  # as REP 103 names OpenCV's axes
-# From OpenCV's camera axes to those of a camera in Blender (x right, y up, z backwards) and in Unity (x right, y up, z
-# forward: left-handed); and from a mesh's axes to those that Unity's importers give it.
-BLENDER_CAMERA = np.diag([1.0, -1.0, -1.0])
+# From OpenCV's camera axes to those of a camera in Blender and OpenGL (x right, y up, z backwards) and in Unity (x
+# right, y up, z forward: left-handed); and from a mesh's axes to those that Unity's importers give it.
+BLENDER_CAMERA = OPENGL_CAMERA = np.diag([1.0, -1.0, -1.0])
 UNITY_CAMERA = np.diag([1.0, -1.0, 1.0])
 UNITY_MESH = np.diag([-1.0, 1.0, 1.0])
 
@@ -88,6 +89,22 @@ def check_formats(formats: Sequence[str]) -> None:
 def to_blender(T_cam_obj: Pose) -> Pose:
     """The object's pose in a Blender camera's own frame: ``object.matrix_world = camera.matrix_world @ this``."""
     return Pose(BLENDER_CAMERA @ T_cam_obj.R, BLENDER_CAMERA @ T_cam_obj.t)
+
+
+def to_opengl(T_cam_obj: Pose) -> Pose:
+    """The object's pose before OpenGL's usual camera (x right, y up, looking along -z): the model-view matrix."""
+    return Pose(OPENGL_CAMERA @ T_cam_obj.R, OPENGL_CAMERA @ T_cam_obj.t)
+
+
+def opengl_projection(camera: Camera, near: float, far: float) -> NDArray[np.float64]:
+    """(4, 4), the projection matrix that goes with `to_opengl`, row by row: a viewport of the photograph's size then
+    shows the object where the photograph does, the photograph's first row at the top. near, far: metres, 0 < near <
+    far. Raises ConfigError."""
+    if not 0 < near < far:
+        raise ConfigError(f"near {near:g} and far {far:g}: metres in front of the camera, 0 < near < far.")
+    flip = np.diag([1.0, -1.0, 1.0, 1.0])  # clip space with y up
+    T_cam_gl = np.diag([*np.diag(OPENGL_CAMERA), 1.0])
+    return np.asarray(flip @ camera.gl_projection(near, far) @ T_cam_gl, np.float64)
 
 
 def to_unity(T_cam_obj: Pose) -> Pose:
