@@ -150,6 +150,8 @@ def test_options_named_in_texts_exist() -> None:
             yield from options(each)
 
     known = {*options(get_command(app)), "--help"}
+    for file in (ROOT / "benchmarks").glob("*.py"):
+        known |= set(re.findall(r'"(--[a-z][a-z-]*)"', file.read_text()))
     for page in PAGES:
         if page.name in ("log.md", "results.md", "releasing.md"):
             continue
