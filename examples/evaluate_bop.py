@@ -21,7 +21,7 @@ def main() -> None:
         begin(SynthConfig("randomised", images, seed=7, split="test"), dataset, {1: locomotive()})
     run(dataset, Machines(), lambda done, count: print(f"\r{done} of {count} pictures", end="\n" * (done == count)))
 
-    # "refine" starts from disturbed true poses; "estimate" from true masks, or from detections.
+    # "refine" starts from disturbed true poses; "estimate" from true boxes, or from detections.
     options = EvalOptions("refine", root=dataset, split="test", min_visible=0.3)
     outcome = evaluate(options, out / "refine", with_vsd=False, force=True)
     for measure, percent in outcome.results["mean"].items():  # over objects

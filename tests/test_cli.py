@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import trimesh
 from typer.main import get_command
 from typer.testing import CliRunner, Result
 
@@ -83,8 +84,16 @@ def test_every_command_has_help(command: str) -> None:
     assert "Usage" in result.stdout
 
 
-def test_version() -> None:
-    assert CliRunner().invoke(app, ["--version"]).stdout == f"posekit {__version__}\n"
+@pytest.mark.parametrize("command", [*sorted(get_command(app).commands), "train pose"])  # type: ignore[attr-defined]
+def test_every_command_shows_how_much_it_says(command: str) -> None:
+    shown = CliRunner().invoke(app, [*command.split(), "--help"]).stdout
+    assert all(word in shown for word in ("--quiet", "-q", "--verbose", "-v", "--debug"))
+    assert "<bool>" not in shown, "flags take no value"
+
+
+@pytest.mark.parametrize("flag", ["--version", "-V"])
+def test_version(flag: str) -> None:
+    assert CliRunner().invoke(app, [flag]).stdout == f"posekit {__version__}\n"
 
 
 # --- success ----------------------------------------------------------------------------------------------------
@@ -154,6 +163,20 @@ def test_what_is_not_reliable_says_so_first(
     assert first.startswith("toy: reliable:" if reliable else "toy: NOT RELIABLE:")
     assert "converged" not in found.stderr
     assert invoke(command, json="-").exit_code == 0, "it has to be asked for"
+
+
+def test_quiet_and_verbose(invoke: Invoke, monkeypatch: pytest.MonkeyPatch) -> None:
+    usual, quiet = (invoke("refine", None, *flags, camera=None, units="auto") for flags in ((), ("-q",)))
+    assert "note: toy.ply" in usual.stderr and "debug:" not in usual.stderr
+    assert "T_cam_obj" in quiet.stdout and "note:" not in quiet.stderr
+    assert "warning: photo.png: its camera is not known" in quiet.stderr
+    told = invoke("estimate", None, "--verbose", "--min-score", "0").stderr
+    for words in ("debug: loading the networks: ", "debug: toy: 5 first poses in ", "debug: toy: pose 1 of 5: rank "):
+        assert words in told, told
+    front = CliRunner().invoke(app, ["-q", "estimate", "a.png", "--model", "b.ply", "--least", "0"])
+    assert front.exit_code == 1 and front.stderr.startswith("error:"), "before the command too; the notice is a note"
+    both = CliRunner().invoke(app, ["doctor", "-q", "-v"])
+    assert both.exit_code == 2 and "--quiet and --verbose" in both.stderr
 
 
 def test_json_on_standard_output_is_alone_there(invoke: Invoke, tmp_path: Path) -> None:
@@ -235,6 +258,27 @@ def test_what_the_mesh_and_the_picture_do_not_allow_is_said_once(example: Exampl
     assert "only 39 pixels large 2 of 3 times" in size
 
 
+def test_a_symmetry_that_nobody_told_is_noted(invoke: Invoke, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    square = trimesh.creation.box((0.06, 0.06, 0.1))
+    square.export(tmp_path / "post.ply")
+    options = {"model": tmp_path / "post.ply", "units": "m", "json": "-"}
+    told = invoke("refine", **options)
+    assert "post looks the same after half a turn about its x axis, half a turn" in " ".join(told.stderr.split()), (
+        told.stderr
+    )
+    assert told.stderr.count("pass --symmetry x:2,y:2,z:4 to") == 1
+    [kept] = (tmp_path / "cache" / "posekit" / "symmetries").iterdir()
+    assert kept.read_text() == "x:2,y:2,z:4\n"
+    for stated in ("none", "z:4", "detect"):
+        again = invoke("refine", symmetry=stated, **options)
+        assert again.exit_code == 0 and "pass --symmetry" not in again.stderr
+        assert (json.loads(again.stdout)["estimates"][0]["branch"] is None) == (stated == "none")
+    assert "note: post.ply: looks the same after half a turn about its x axis" in again.stderr
+    (tmp_path / "models_info.json").write_text(json.dumps({"post": {}}))
+    assert "looks the same" not in invoke("refine", **options).stderr, "the data set knows"
+
+
 def test_a_mesh_without_colours_is_told_of(invoke: Invoke, example: Example, tmp_path: Path) -> None:
     (tmp_path / "grey.ply").write_text(ply(replace(example.model, colors=np.zeros_like(example.model.vertices, "u1"))))
     lines = [
@@ -285,6 +329,19 @@ def test_formats_for_other_programs(invoke: Invoke, folder: Path, tmp_path: Path
     assert_fails(invoke("refine", None, "--format", "xml"), "--format xml", "blender")
 
 
+def test_a_recording_for_rerun(invoke: Invoke, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = invoke("estimate", None, "--rerun", top=2, out="out")
+    assert found.exit_code == 0 and "recording: out/estimate.rrd" in found.stdout, found.output
+    recorded = (tmp_path / "out" / "estimate.rrd").read_bytes()
+    assert recorded[:3] == b"RRF"
+    for entity in (b"objects/0-toy", b"camera/image", b"alternatives/0-toy/2", b"refinement/0-toy", b"iteration"):
+        assert entity in recorded
+    assert not list((tmp_path / "out").glob(".*"))
+    assert_fails(invoke("refine", None, "--rerun", json="-"), "--rerun with --json", "--out")
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert_fails(invoke("refine", "missing.png", "--rerun"), "posekit[rerun]")
+
+
 def test_an_estimate_can_be_made_twice(invoke: Invoke, tmp_path: Path) -> None:
     assert [invoke("estimate").exit_code for _ in range(2)] == [0, 0]
     first, second = (tmp_path / name / "photo" / "result.json" for name in ("posekit-out", "posekit-out-2"))
@@ -309,6 +366,17 @@ def test_render_views(invoke: Invoke, example: Example, tmp_path: Path) -> None:
     [drawn] = Renderer().render(example.model, [pose], camera)
     assert about["views"][0]["mask"] == "0000_mask.png"
     np.testing.assert_array_equal(drawn.mask, mask > 0)
+
+
+def test_render_views_and_doctor_as_json(invoke: Invoke, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = invoke("render-views", None, views=2, size="16x16", out="views", units="m", json="-")
+    assert json.loads(found.stdout) == json.loads((tmp_path / "views" / "views.json").read_text())
+    assert "contact_sheet.png" in found.stderr
+    monkeypatch.setattr(doctor, "examine", lambda: [doctor.Finding("OpenGL", "none", "problem", "install it")])
+    report = CliRunner().invoke(app, ["doctor", "--json", "-"])
+    entry = {"topic": "OpenGL", "text": "none", "state": "problem", "todo": "install it"}
+    assert json.loads(report.stdout)["findings"] == [entry] and json.loads(report.stdout)["problems"] == 1
+    assert report.exit_code == 1 and "-> install it" in report.stderr
 
 
 def test_demo(invoke: Invoke, folder: Path, tmp_path: Path) -> None:

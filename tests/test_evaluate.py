@@ -484,6 +484,24 @@ def test_the_report_stands_alone(alone: Path) -> None:
     assert page.count("data:image/jpeg;base64,") == 8
 
 
+def test_true_masks_are_said_where_they_are_used(alone: Path, root: Path, tmp_path: Path) -> None:
+    """By the table's title and a line below it, in results.json, and in the report; standard output is JSON alone."""
+    args = ("--stage", "refine", "--root", root, "--masks", "true", "--images", "2/0", "--json", "-", *QUICK_ARGS)
+    done = run(*args, "--out", tmp_path / "out")
+    assert done.exit_code == 0, done.output
+    results = json.loads(done.stdout)
+    assert results == json.loads((tmp_path / "out" / "results.json").read_text())
+    assert results["true_masks"] and results["title"].endswith(": refine, true masks")
+    assert "refine, true masks, percent" in done.stderr and "True masks: drawn from the annotated poses" in done.stderr
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert page.count("refine, true masks") == 2 and "True masks: drawn" in page
+    without = json.loads((alone / "results.json").read_text())
+    assert not without["true_masks"] and "rue masks" not in (alone / "report.html").read_text()
+    titles = [EvalOptions("estimate", detections=d).title for d in ("gt-boxes", "gt-masks", "detector")]
+    assert titles == ["estimate from true boxes", "estimate, true masks", "estimate"]
+    assert EvalOptions("estimate").detections == "gt-boxes" and EvalOptions("refine").masks == "none"
+
+
 def test_the_csv_of_a_run_scores_as_the_run(alone: Path, root: Path, tmp_path: Path) -> None:
     csv = alone / "posekit-lite-refine_small-test.csv"
     result = run("--stage", "score", "--root", root, "--csv", csv, "--out", tmp_path / "s")
@@ -580,6 +598,8 @@ def test_a_run_compared_with_itself_and_with_a_better_one(root: Path, tmp_path: 
     assert better["2deg_2cm"].clear and not better["5deg_5cm"].clear
     shown = CliRunner().invoke(app, ["eval", "--compare", str(results["off"]), str(results["truth"])])
     assert shown.exit_code == 0 and "+100.0 to +100.0 *" in shown.output
+    told = CliRunner().invoke(app, ["eval", "--compare", str(results["off"]), str(results["truth"]), "--json", "-"])
+    assert json.loads(told.stdout)["differences"][0]["b"] == 100 and "+100.0 to +100.0 *" in told.stderr
 
 
 def test_the_interval_covers_a_known_difference(tmp_path: Path) -> None:

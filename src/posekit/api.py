@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import overload
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from posekit.camera import Camera
-from posekit.detect import BoxPrompt, MaskPrompt
+from posekit.detect import BoxPrompt, MaskPrompt, from_supervision
+from posekit.detect.prompts import clip_box
 from posekit.errors import ImageError, OutputError, PromptError
 from posekit.estimate.estimator import EstimateOptions, PoseEstimator
 from posekit.estimate.instances import find_instances
 from posekit.geometry import Pose
 from posekit.io.calibration import Calibration, load_calibration
+from posekit.io.documents import camera_entry
 from posekit.io.files import write_bytes_atomic, write_text_atomic
 from posekit.io.load import ASSUMED_FOV, load_mask, load_view
 from posekit.lens import Lens
@@ -109,6 +111,7 @@ def estimate(
     box: Sequence[float] | None = None,
     mask: str | Path | NDArray[np.bool_] | None = None,
     *,
+    detections: Sequence[Detection] | Any | None = None,
     camera: Camera | str | Path | None = None,
     units: str = "auto",
     symmetry: str | None = None,
@@ -119,15 +122,20 @@ def estimate(
 ) -> Result:
     """The pose of an object in a photograph.
 
-    image: a file, uint8 RGB (H, W, 3), or a View, whose own camera counts. model: a mesh's file (with ``units`` and
-    ``symmetry``), an ObjectModel, or a PoseEstimator, which saves loading the networks again for the next picture (and
-    has its own weights and options). box: edges (x0, y0, x1, y1), pixels. mask: a file or bool (H, W). Without either
-    the object is looked for. camera: a Camera, or what ``--camera`` takes; without it the photograph's EXIF data, else
-    a field of view of 60 degrees, with a warning.
+    image: a file, uint8 RGB (H, W, 3), or a View, whose own camera counts.
+    model: a mesh's file (with ``units`` and ``symmetry``), an ObjectModel, or a PoseEstimator, which spares loading the
+    networks again for the next picture (and has its own weights and options).
+    box: edges (x0, y0, x1, y1), pixels. mask: a file or bool (H, W).
+    detections: of another program, a list of Detection or ``supervision.Detections``: those whose label is the mesh's
+    name (case does not count), or all where they have no label, or one label only.
+    Box, mask and detections are of the photograph as it was taken; without any of them the object is looked for.
+    camera: a Camera, or what ``--camera`` takes; without it the photograph's EXIF data, else a field of view of 60
+    degrees, with a warning.
     Raises PosekitError's children: ImageError, MeshError, CameraError, PromptError, WeightsError, RenderError.
     """
-    if box is not None and mask is not None:
-        raise PromptError("box and mask were both given; one says where the object is: give one of them.")
+    given = [name for name, it in (("box", box), ("mask", mask), ("detections", detections)) if it is not None]
+    if len(given) > 1:
+        raise PromptError(f"{' and '.join(given)} were both given; one says where the object is: give one of them.")
     view = _view_of(image, camera)
     if isinstance(model, PoseEstimator):
         estimator = model
@@ -135,7 +143,11 @@ def estimate(
         mesh = model if isinstance(model, ObjectModel) else ObjectModel.load(model, units=units, symmetry=symmetry)
         file = None if weights is None else Path(weights)
         estimator = PoseEstimator(mesh, preset=preset, weights=file, options=options, device=device)
-    [found] = find_instances(lambda _: estimator, view, [estimator.model], _found(view, estimator, box, mask))
+    if detections is not None:
+        where = _of_model(view, estimator.model, detections)
+    else:
+        where = _found(view, estimator, box, mask)
+    [found] = find_instances(lambda _: estimator, view, [estimator.model], where)
     return Result(view, estimator, tuple(found.instances))
 
 
@@ -143,16 +155,11 @@ def result_json(
     view: View, estimates: Sequence[Estimate], weights_hash: str, about: dict[str, object] | None = None
 ) -> str:
     """The text of result.json. about: further entries, such as the files' names."""
-    camera, lens = view.camera, view.lens
-    seen_by: dict[str, object] = {"K": camera.K, "width": camera.width, "height": camera.height}
-    if lens is not None:  # boxes, masks and overlays are of the undistorted picture
-        taken = {"K": lens.camera.K, "width": lens.camera.width, "height": lens.camera.height}
-        seen_by["undistorted_from"] = {**taken, "model": lens.model, "distortion_coefficients": list(lens.coefficients)}
     return estimates_to_json(
         estimates,
         weights_hash=weights_hash,
         versions={name: version(name) for name in ("torch", "numpy", "opencv-python-headless", "moderngl")},
-        about={**(about or {}), "camera": seen_by},
+        about={**(about or {}), "camera": camera_entry(view)},
     )
 
 
@@ -184,6 +191,35 @@ def _check_size(camera: Camera, image: NDArray[np.uint8]) -> None:
             f"the camera's picture has {camera.width}x{camera.height} pixels, the image "
             f"{image.shape[1]}x{image.shape[0]}: use Camera.resized."
         )
+
+
+def _of_model(view: View, model: ObjectModel, detections: Any) -> list[Detection]:
+    """What is said of a mesh, in the undistorted picture. Raises PromptError."""
+    found = from_supervision(detections) if hasattr(detections, "xyxy") else list(detections)
+    for each in found:
+        if not isinstance(each, Detection):
+            raise PromptError(f"detections are a list of Detection or supervision.Detections, not of {type(each)}.")
+    labels = {each.label.lower() for each in found if each.label is not None}
+    if len(labels) > 1 or model.name.lower() in labels:
+        own = [each for each in found if each.label is not None and each.label.lower() == model.name.lower()]
+        if not own:
+            raise PromptError(
+                f"the detections are of {', '.join(sorted(labels))}, none of {model.name}: name the mesh after its "
+                "class, or give those of its class alone."
+            )
+        found = own
+    lens, camera = view.lens, view.camera
+    taken = camera.size if lens is None else lens.camera.size
+    placed = []
+    for each in found:
+        box, mask = each.box, each.mask
+        if mask is not None and mask.shape != taken[::-1]:
+            raise PromptError(f"a mask is {mask.shape[1]}x{mask.shape[0]}, its picture {taken[0]}x{taken[1]}.")
+        if lens is not None:
+            box = lens.undistorted_box(box)
+            mask = None if mask is None else lens.undistorted_mask(mask)
+        placed.append(replace(each, box=clip_box(box, camera), mask=mask, label=model.name))
+    return placed
 
 
 def _found(

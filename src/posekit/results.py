@@ -22,6 +22,11 @@ from posekit.geometry import Pose
 RELIABLE_SCORE = 0.5
 RELIABLE_ANGLE_DEG = 15.0
 
+# The documents that posekit writes as JSON (docs/result-json.md): their kinds, and the version of their form. A new
+# entry leaves the version as it is; an entry that goes or changes its meaning raises it.
+RESULT_SCHEMA, FRAME_SCHEMA, DETECTIONS_SCHEMA = "posekit-result", "posekit-frame", "posekit-detections"
+SCHEMA_VERSION = 1
+
 
 class Source(StrEnum):
     """Where a detection comes from."""
@@ -153,8 +158,26 @@ def estimates_to_json(
     versions: of other software, besides posekit's own. about: further entries of the file (image, camera, ...).
     """
     origin = {"weights_hash": weights_hash, "versions": {"posekit": __version__, **(versions or {})}}
-    document = {**(about or {}), "estimates": [_estimate_to_dict(estimate) | origin for estimate in estimates]}
-    return json.dumps(_strict(document), indent=1, allow_nan=False) + "\n"
+    entries = [_estimate_to_dict(estimate) | origin for estimate in estimates]
+    return document_to_json(RESULT_SCHEMA, {**(about or {}), "estimates": entries})
+
+
+def document_to_json(schema: str, entries: Mapping[str, Any], indent: int | None = 1) -> str:
+    """A document's text, which begins with its kind (RESULT_SCHEMA and so on) and version: strict JSON, numbers that
+    are not finite are null. indent: None writes one line."""
+    document = {"schema": schema, "schema_version": SCHEMA_VERSION, **entries}
+    return json.dumps(_strict(document), indent=indent, allow_nan=False) + "\n"
+
+
+def check_schema(document: Any, label: str = "the file") -> None:
+    """Whether this posekit knows the form of a document; one without a version is of posekit 0.1, or of another
+    program. Raises PromptError where the version is a newer one."""
+    version = document.get("schema_version") if isinstance(document, Mapping) else None
+    if isinstance(version, int) and version > SCHEMA_VERSION:
+        raise PromptError(
+            f"{label} has schema_version {version}, and posekit {__version__} reads versions up to {SCHEMA_VERSION}: "
+            "a newer posekit wrote it. Update posekit, or write the file again with this one."
+        )
 
 
 def estimate_to_json(
@@ -169,9 +192,12 @@ def estimate_to_json(
 
 
 def estimates_from_json(text: str) -> list[Estimate]:
-    """What `estimates_to_json` wrote; masks are not in the file. Raises PromptError where it is something else."""
+    """What `estimates_to_json` wrote, also that of posekit 0.1; masks are not in the file. Raises PromptError where it
+    is something else, or of a newer posekit."""
     try:
-        return [_estimate_from_dict(entry) for entry in json.loads(text)["estimates"]]
+        document = json.loads(text)
+        check_schema(document)
+        return [_estimate_from_dict(entry) for entry in document["estimates"]]
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise PromptError(
             f"this is no posekit result ({_why(error)}): give a result.json of posekit estimate."
@@ -209,6 +235,7 @@ def _estimate_to_dict(estimate: Estimate) -> dict[str, Any]:
 
 def _estimate_from_dict(entry: Mapping[str, Any]) -> Estimate:
     found = entry["detection"]
+    mask_edge_std_deg = entry.get("mask_edge_std_deg", entry.get("contour_std_deg"))  # the latter in 0.1
     return Estimate(
         T_cam_obj=Pose.from_matrix(entry["T_cam_obj"]),
         angle=_radians(entry["angle_deg"]),
@@ -221,7 +248,7 @@ def _estimate_from_dict(entry: Mapping[str, Any]) -> Estimate:
         and Detection(_box(found["box"]), None, _number(found["score"]), found["label"], Source(found["source"])),
         trace=tuple(Step(Pose.from_matrix(s["T_cam_obj"]), _radians(s["angle_deg"])) for s in entry["trace"]),
         timings={stage: _number(seconds) for stage, seconds in entry["timings_s"].items()},
-        mask_edge_std=None if entry.get("mask_edge_std_deg") is None else _radians(entry["mask_edge_std_deg"]),
+        mask_edge_std=None if mask_edge_std_deg is None else _radians(mask_edge_std_deg),
         branch=None if entry.get("branch") is None else Branch(entry["branch"]),
         alternatives=tuple(_estimate_from_dict(other) for other in entry.get("alternatives", ())),
     )

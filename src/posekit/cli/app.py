@@ -9,9 +9,6 @@ import logging
 import shlex
 import sys
 import traceback
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -34,8 +31,12 @@ from posekit.cli import (
     train,
     view,
 )
+from posekit.cli.messages import MESSAGES, Command, Flags, hoisted, messages, obey_no_color, tell
 from posekit.errors import PosekitError
 
+log = logging.getLogger("posekit")
+
+RENAMED_HERE = "posekit.renamed"  # in a context: former names that were given
 INTERRUPTED = 130  # as shells count it: 128 + SIGINT
 RENAMED = {
     "--least": "--min-score",
@@ -49,39 +50,45 @@ RENAMED = {
 }  # options that had other names in 0.1
 
 
-class Commands(TyperGroup):
+class Commands(Flags, TyperGroup):
     """Turns a PosekitError into one line on standard error and exit code 1, Ctrl-C into exit code 130."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        return list(super().parse_args(ctx, [_renamed(arg) for arg in args]))
+        """The arguments with the options of all commands first, and today\'s names of those that were renamed."""
+        obey_no_color(ctx)
+        ctx.meta[RENAMED_HERE] = [name for arg in args if (name := arg.partition("=")[0]) in RENAMED]
+        return list(super().parse_args(ctx, hoisted([_renamed(arg) for arg in args])))
 
     def invoke(self, ctx: Any) -> Any:
+        """Run the command; see the class for how errors end it."""
+        quiet, verbose = bool(ctx.params.get("quiet")), bool(ctx.params.get("verbose"))
+        if quiet and verbose:
+            ctx.fail("--quiet and --verbose were both given: give one of them.")
         try:
-            with _messages():
+            with messages(quiet, verbose):
+                for name in ctx.meta[RENAMED_HERE]:
+                    log.info("%s is now called %s; the old name goes with the next release.", name, RENAMED[name])
                 return super().invoke(ctx)
         except PosekitError as error:
             if ctx.params.get("debug"):
                 raise
-            _tell("error", str(error), typer.colors.RED)
+            tell("error", str(error), typer.colors.RED)
             raise typer.Exit(1) from error
         except KeyboardInterrupt as error:
-            _tell("interrupted", "nothing more is written", typer.colors.RED)
+            tell("interrupted", "nothing more is written", typer.colors.RED)
             raise typer.Exit(INTERRUPTED) from error
         except Exception as error:  # a fault of posekit or of a library: said like any other, with what to report
             framework = type(error).__module__.partition(".")[0] in ("typer", "click")  # wrong usage, an exit
             if framework or ctx.params.get("debug") or isinstance(error, BrokenPipeError):
                 raise
-            _tell("error", _unexpected(error), typer.colors.RED)
+            tell("error", _unexpected(error), typer.colors.RED)
             raise typer.Exit(1) from error
 
 
 def _renamed(arg: str) -> str:
     """An argument with today's name of its option."""
     name, equals, value = arg.partition("=")
-    if name not in RENAMED:
-        return arg
-    _tell("note", f"{name} is now called {RENAMED[name]}; the old name goes with the next release.", typer.colors.BLUE)
-    return RENAMED[name] + equals + value
+    return RENAMED.get(name, name) + equals + value
 
 
 def _unexpected(error: Exception) -> str:
@@ -95,37 +102,6 @@ def _unexpected(error: Exception) -> str:
         f"{' '.join(map(shlex.quote, sys.argv[1:]))}. This is a fault of posekit {__version__}: please report it with "
         "this line, the files if they may be shared, and what posekit --debug prints."
     )
-
-
-@contextmanager
-def _messages() -> Iterator[None]:
-    """The library's log and Python's warnings as lines on standard error."""
-    log, handler = logging.getLogger("posekit"), _LogLines()
-    level = log.level
-    log.addHandler(handler)
-    log.setLevel(logging.INFO)
-    try:
-        with warnings.catch_warnings():
-            warnings.showwarning = _show_warning
-            yield
-    finally:
-        log.removeHandler(handler)
-        log.setLevel(level)
-
-
-class _LogLines(logging.Handler):
-    def emit(self, record: logging.LogRecord) -> None:
-        loud = record.levelno >= logging.WARNING
-        _tell("warning" if loud else "note", record.getMessage(), typer.colors.YELLOW if loud else typer.colors.BLUE)
-
-
-def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
-    _tell("warning", str(message), typer.colors.YELLOW)
-
-
-def _tell(kind: str, text: str, colour: str) -> None:
-    line = " ".join(text.splitlines())
-    typer.echo(f"{typer.style(f'{kind}:', fg=colour, bold=True)} {line}", err=True)
 
 
 def _show_version(wanted: bool) -> None:
@@ -144,30 +120,52 @@ app = typer.Typer(
 
 @app.callback()
 def _options(
-    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
+    quiet: Annotated[
+        bool,
+        typer.Option(
+            "--quiet",
+            "-q",
+            help="Print results, warnings and errors only: no notes, no progress.",
+            rich_help_panel=MESSAGES,
+        ),
+    ] = False,
+    verbose: Annotated[
+        bool,
+        typer.Option(
+            "--verbose",
+            "-v",
+            help="Also print what is done: stages with their seconds, first poses, the choice.",
+            rich_help_panel=MESSAGES,
+        ),
+    ] = False,
+    debug: Annotated[
+        bool, typer.Option("--debug", help="Show the traceback of an error.", rich_help_panel=MESSAGES)
+    ] = False,
     version: Annotated[
-        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version and exit.")
+        bool,
+        typer.Option("--version", "-V", callback=_show_version, is_eager=True, help="Print the version and exit."),
     ] = False,
 ) -> None:
     """From a photograph and a CAD file to the object's 6D pose."""
 
 
-app.command("estimate")(estimate.estimate)
-app.command("detect")(detect.detect)
-app.command("refine")(refine.refine)
-app.command("track")(track.track)
-app.command("view")(view.view)
-app.command("render-views")(render_views.render_views)
-app.command("synth")(synth.synth)
+app.command("estimate", cls=Command)(estimate.estimate)
+app.command("detect", cls=Command)(detect.detect)
+app.command("refine", cls=Command)(refine.refine)
+app.command("track", cls=Command)(track.track)
+app.command("view", cls=Command)(view.view)
+app.command("render-views", cls=Command)(render_views.render_views)
+app.command("synth", cls=Command)(synth.synth)
 app.add_typer(train.train, name="train")
-app.command("eval")(eval.evaluate)
-app.command("download")(download.download)
-app.command("calibrate")(calibrate.calibrate)
-app.command("doctor")(doctor.doctor)
-app.command("demo")(demo.demo)
+app.command("eval", cls=Command)(eval.evaluate)
+app.command("download", cls=Command)(download.download)
+app.command("calibrate", cls=Command)(calibrate.calibrate)
+app.command("doctor", cls=Command)(doctor.doctor)
+app.command("demo", cls=Command)(demo.demo)
 
 
 def main() -> None:
+    """The entry point of the command line."""
     try:
         app(prog_name="posekit")
     except KeyboardInterrupt:  # before typer watches for it, or after

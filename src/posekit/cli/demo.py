@@ -14,7 +14,7 @@ from posekit.cli.options import ForceOption, OutOption, WeightsOption
 def demo(
     out: OutOption = None,
     weights: WeightsOption = None,
-    seed: Annotated[int, typer.Option(help="Of the example.")] = 0,
+    seed: Annotated[int, typer.Option(help="Random seed of the example picture.")] = 0,
     force: ForceOption = False,
 ) -> None:
     """Estimate a pose in an example that is made on the spot, and compare it with the truth."""

@@ -16,6 +16,7 @@ from posekit.cli.options import (
     DetectorOption,
     ForceOption,
     ImageArgument,
+    JsonOption,
     OutOption,
     ThreadsOption,
     UnitsOption,
@@ -38,7 +39,7 @@ def detect(
             "--model",
             "-m",
             metavar="MESH",
-            help="What to look for; repeat it. Without it anything is reported.",
+            help="Mesh to look for; repeat the option for several. Without it, objects of any kind are reported.",
             rich_help_panel=INPUT,
         ),
     ] = None,
@@ -47,28 +48,41 @@ def detect(
     detector: DetectorOption = None,
     min_score: Annotated[
         float | None,
-        typer.Option(min=0, max=1, help="Leave out detections with a lower score.", rich_help_panel=SCORES),
+        typer.Option(
+            min=0,
+            max=1,
+            help="Drop detections with a lower score (0 to 1). Default: 0.5 with --verify, else the detector's own.",
+            rich_help_panel=SCORES,
+        ),
     ] = None,
     max_detections: Annotated[
-        int, typer.Option(min=1, help="Keep at most so many detections of a mesh (novel).", rich_help_panel=SCORES)
+        int,
+        typer.Option(
+            min=1, help="Largest number of detections of each mesh (--detector novel only).", rich_help_panel=SCORES
+        ),
     ] = 3,
     verify: Annotated[
         bool | None,
         typer.Option(
-            help="Score by the poses found there, a second each; by default with --model and the novel detector.",
+            help="Estimate a pose for each detection (about a second each) and score it by that. Default: on with "
+            "--model and --detector novel.",
             rich_help_panel=SCORES,
         ),
     ] = None,
     threads: ThreadsOption = None,
     scene: Annotated[
-        int | None, typer.Option(help="scene_id for BOP; by default the folder's number.", rich_help_panel=OUTPUT)
+        int | None,
+        typer.Option(
+            help="scene_id in bop.json. Default: the number of the scene's folder, else 0.", rich_help_panel=OUTPUT
+        ),
     ] = None,
     out: OutOption = None,
     force: ForceOption = False,
+    json: JsonOption = None,
 ) -> None:
-    """Find objects in a photograph: boxes, masks and scores, as COCO and BOP JSON."""
-    from posekit.cli.output import OutputFolder
-    from posekit.detect.external import to_bop, to_coco
+    """Find objects in a photograph: boxes, masks and scores, as COCO, BOP or posekit JSON."""
+    from posekit.cli.output import Destination
+    from posekit.detect.external import to_bop, to_coco, to_document
     from posekit.detect.novel import NovelDetector, NovelOptions, make_detector
     from posekit.errors import ConfigError
     from posekit.estimate.instances import SearchOptions
@@ -79,7 +93,7 @@ def detect(
 
     if verify and not model:
         raise ConfigError("--verify looks for poses of meshes: pass --model MESH, or leave it out.")
-    folder = OutputFolder.chosen(out, Path("posekit-out") / f"{image.stem}-detections", force)
+    destination = Destination.chosen(out, Path("posekit-out") / f"{image.stem}-detections", force, json)
     use_threads(threads)
     view = load_view(image, camera)
     meshes = [ObjectModel.load(path, units=units) for path in model or ()]
@@ -94,22 +108,26 @@ def detect(
     if verify and isinstance(finder, NovelDetector):  # the poses are held to the minimum score, not the detections
         finder = NovelDetector(finder.detector, finder.renderer, NovelOptions(max_detections=max_detections))
     started = time.perf_counter()
-    found = sorted(finder.detect(view, meshes), key=lambda d: -d.score)
+    with destination.working("detecting"):
+        found = sorted(finder.detect(view, meshes), key=lambda d: -d.score)
     if verify:
         found = _verified(view, found, meshes, SearchOptions().min_score if min_score is None else min_score)
     seconds = time.perf_counter() - started
     for detection in found:
-        typer.echo(
+        destination.say(
             f"{detection.label or 'object'}: score {detection.score:.2f}, box "
             + ",".join(f"{v:.0f}" for v in detection.box)
         )
     if not found:
         names = ", ".join(m.name for m in meshes) or "an object"
-        typer.echo(f"{names} not found.")
-    typer.echo(f"{len(found)} detections in {seconds:.2f} s")
-    typer.echo(f"overlay: {folder.write('overlay.png', png(detections_overlay(view, found)))}")
-    typer.echo(f"COCO: {folder.write('coco.json', to_coco(found, classes, image, view.camera.size))}")
-    typer.echo(f"BOP: {folder.write('bop.json', to_bop(found, classes, image, seconds, scene))}")
+        destination.say(f"{names} not found.")
+    destination.say(f"{len(found)} detections in {seconds:.2f} s")
+    folder = destination.folder
+    if folder is not None:
+        destination.say(f"overlay: {folder.write('overlay.png', png(detections_overlay(view, found)))}")
+        destination.say(f"COCO: {folder.write('coco.json', to_coco(found, classes, image, view.camera.size))}")
+        destination.say(f"BOP: {folder.write('bop.json', to_bop(found, classes, image, seconds, scene))}")
+    destination.write_json(to_document(found, view, image, seconds))
 
 
 def _verified(

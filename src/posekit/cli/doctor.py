@@ -6,12 +6,14 @@ import platform
 import sys
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from json import dumps
 from typing import Any
 
 import typer
 
 from posekit._version import __version__
+from posekit.cli.options import JsonOption
 from posekit.errors import RenderError, WeightsError
 
 
@@ -29,12 +31,15 @@ CPU_INDEX = "https://download.pytorch.org/whl/cpu"  # PyTorch's own, of builds w
 _STYLES = {"ok": "green", "note": "yellow", "problem": "bold red"}
 
 
-def doctor() -> None:
+def doctor(json: JsonOption = None) -> None:
     """Check OpenGL, torch, OpenVINO and the weights; exit code 1 where something essential is missing."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
+    from posekit.cli.output import check_json, write_json
+
+    check_json(json)
     findings = examine()
     table = Table.grid(padding=(0, 2))
     for finding in findings:
@@ -42,9 +47,11 @@ def doctor() -> None:
         if finding.todo:
             text.append(f"\n-> {finding.todo}", style="bold")
         table.add_row(Text(finding.state, style=_STYLES[finding.state]), finding.topic, text)
-    console = Console()
+    console = Console(stderr=json == "-")
     console.print(table)
     problems = sum(finding.state == "problem" for finding in findings)
+    entries = [asdict(finding) for finding in findings]
+    write_json(json, dumps({"posekit": __version__, "problems": problems, "findings": entries}, indent=1) + "\n")
     if problems:
         console.print(
             f"{problems} problem{'s' if problems > 1 else ''}: posekit cannot work here yet.", style="bold red"

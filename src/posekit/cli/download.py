@@ -9,11 +9,19 @@ import typer
 
 
 def download(
-    name: Annotated[str, typer.Argument(help="lmo, lm, linemod, ycbv, tless, tudl, icbin, itodd, hb, ...")],
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="NAME", help="Name of the data set: lmo, lm, linemod, ycbv, tless, tudl, icbin, itodd, hb, ..."
+        ),
+    ],
     root: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Folder of all data sets; else $POSEKIT_DATA, else the cache.")
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="Folder that holds all data sets. Default: $POSEKIT_DATA, else ~/.cache/posekit/data."
+        ),
     ] = None,
-    keep: Annotated[bool, typer.Option("--keep", help="Keep the archives.")] = False,
+    keep: Annotated[bool, typer.Option("--keep", help="Keep the archives after they are unpacked.")] = False,
 ) -> None:
     """Fetch a data set in BOP layout; a download that was interrupted is resumed."""
     from posekit.datasets.download import download as fetch

@@ -31,6 +31,7 @@ from posekit.cli.options import (
     OutOption,
     PresetOption,
     RequireReliableOption,
+    RerunOption,
     StopAngleOption,
     StopOption,
     SymmetryOption,
@@ -46,19 +47,26 @@ CANDIDATES = 3  # detections of a mesh that are estimated at least, of which the
 TopOption = Annotated[
     int,
     typer.Option(
-        min=1, metavar="N", help="Keep the N best poses of each object: the result and its alternatives.",
+        min=1, metavar="N",
+        help="Keep the N best distinct poses of each object; the others are the result's alternatives.",
         rich_help_panel=LOOP,
     ),
 ]  # fmt: skip
 InstancesOption = Annotated[
-    int, typer.Option(min=1, metavar="N", help="Of each mesh at most, where it is looked for.", rich_help_panel=LOOP)
+    int,
+    typer.Option(
+        min=1,
+        metavar="N",
+        help="Largest number of instances of each mesh to find; used where no box, mask or detections are given.",
+        rich_help_panel=LOOP,
+    ),
 ]
 MinScoreOption = Annotated[
     float | None,
     typer.Option(
         min=0,
         max=1,
-        help="Least score of an estimate; by default 0 where you say where the object is, else 0.5.",
+        help="Drop estimates with a lower score (0 to 1). Default: 0 with --box, --mask or --detections, else 0.5.",
         rich_help_panel=LOOP,
     ),
 ]
@@ -95,25 +103,27 @@ def estimate(
     json: JsonOption = None,
     blend: BlendOption = 0.0,
     format_: FormatOption = None,
+    rerun: RerunOption = False,
     require_reliable: RequireReliableOption = False,
 ) -> None:
     """Estimate objects' poses in a photograph, from their meshes. A box, a mask or detections help, but need not be."""
     from posekit.cli.output import Destination, end_unless_reliable
 
-    destination = Destination.chosen(out, Path("posekit-out") / image.stem, force, json, format_ or ())
+    recording = "estimate.rrd" if rerun else None
+    destination = Destination.chosen(out, Path("posekit-out") / image.stem, force, json, format_ or (), recording)
 
+    from posekit.cli.meshes import load_meshes
     from posekit.cli.prompts import prompt_for
     from posekit.estimate.estimator import EstimateOptions, Estimators
     from posekit.estimate.instances import SearchOptions, find_instances
     from posekit.io.load import load_view
-    from posekit.mesh.model import ObjectModel
 
     use_threads(threads)
     options = EstimateOptions(
         init, hypotheses, update, stop, iterations, stop_angle, mask_edge=mask_edge, colour_edge=colour_edge, top=top
     )
     view = load_view(image, camera)
-    meshes = [ObjectModel.load(path, units=units, symmetry=symmetry) for path in model]
+    meshes = load_meshes(model, units, symmetry)
     finder = prompt_for(box, mask, mask_from, detections, image, view.lens)
     asked = finder is not None
     if finder is None:
@@ -132,6 +142,8 @@ def estimate(
     with destination.working("estimating"):
         results = find_instances(estimators, view, meshes, found, search)
     paths = [{"image": image, "mesh": path} for path in model]
-    destination.deliver_all(view, [(estimators(each.model), each.instances) for each in results], paths, blend)
+    destination.deliver_all(
+        view, [(estimators(each.model), each.instances) for each in results], paths, blend, symmetry
+    )
     if require_reliable:
         end_unless_reliable([each for found_of in results for each in found_of.instances])

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
+from functools import partial
+from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -16,6 +19,7 @@ from posekit.cli.options import (
     HypothesesOption,
     InitOption,
     IterationsOption,
+    JsonOption,
     MaskEdgeOption,
     PerturbOption,
     PresetOption,
@@ -28,6 +32,8 @@ from posekit.cli.options import (
 from posekit.cli.progress import progress_bar
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from posekit.evaluate import Comparison
 
 DATA, STAGE = "Data", "Stage"
@@ -37,52 +43,85 @@ def evaluate(
     stage: Annotated[
         Literal["refine", "estimate", "track", "score"],
         typer.Option(
-            help="From disturbed truth; from detections; through sequences; or only score a CSV.", rich_help_panel=STAGE
+            help="What is measured: refine (from disturbed true poses), estimate (from detections), track (through "
+            "sequences), or score (the poses in --csv).",
+            rich_help_panel=STAGE,
         ),
     ] = "estimate",
     dataset: Annotated[
-        str | None, typer.Option(metavar="NAME", help="lmo, lm, linemod, ycbv, tless, ...", rich_help_panel=DATA)
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Name of the data set: lmo, lm, linemod, ycbv, tless, ... Not needed with --root.",
+            rich_help_panel=DATA,
+        ),
     ] = None,
     root: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="The data set, or the folder that holds it.", rich_help_panel=DATA),
+        typer.Option(
+            metavar="DIR",
+            help="Folder of the data set, or the one that holds it. Default: as posekit download has it.",
+            rich_help_panel=DATA,
+        ),
     ] = None,
-    split: Annotated[str | None, typer.Option(help="Folder with the scenes.", rich_help_panel=DATA)] = None,
+    split: Annotated[
+        str | None,
+        typer.Option(help="Name of the folder with the scenes, such as test or test_primesense.", rich_help_panel=DATA),
+    ] = None,
     units: Annotated[
-        Units, typer.Option(help="Of the meshes; auto: BOP's mm, or what fits models_info.json.", rich_help_panel=DATA)
+        Units,
+        typer.Option(
+            help="Length unit of the meshes; auto: mm as in BOP, or what models_info.json shows.", rich_help_panel=DATA
+        ),
     ] = "auto",
     objects: Annotated[
-        str | None, typer.Option(metavar="1,9|ape,duck", help="Only these objects.", rich_help_panel=DATA)
+        str | None,
+        typer.Option(metavar="1,9|ape,duck", help="Only these objects, by number or name.", rich_help_panel=DATA),
     ] = None,
     images: Annotated[
         str | None,
-        typer.Option(metavar="N|SCENE/IMAGE,...", help="N pictures spread evenly, or these.", rich_help_panel=DATA),
+        typer.Option(
+            metavar="N|SCENE/IMAGE,...", help="Only N pictures, spread evenly, or only these.", rich_help_panel=DATA
+        ),
     ] = None,
     min_visible: Annotated[
         float | None,
         typer.Option(
-            metavar="SHARE", help="All instances at least as visible; else the test's targets.", rich_help_panel=DATA
+            metavar="SHARE",
+            help="Measure all instances of which at least this share (0 to 1) is visible. Default: the test's targets.",
+            rich_help_panel=DATA,
         ),
     ] = None,
     detections: Annotated[
         str,
         typer.Option(
-            metavar="gt-boxes|gt-masks|detector|FILE.json", help="What estimate starts from.", rich_help_panel=STAGE
+            metavar="gt-boxes|gt-masks|detector|FILE.json",
+            help="What estimate starts from: true boxes, true masks, the detector, or a file in BOP's format.",
+            rich_help_panel=STAGE,
         ),
-    ] = "gt-masks",
+    ] = "gt-boxes",
     detector: Annotated[
-        str, typer.Option(metavar="novel|FILE", help="With --detections detector: which.", rich_help_panel=STAGE)
+        str,
+        typer.Option(metavar="novel|FILE", help="With --detections detector: which detector.", rich_help_panel=STAGE),
     ] = "novel",
     masks: Annotated[
-        Literal["true", "none"], typer.Option(help="What refine knows of the silhouette.", rich_help_panel=STAGE)
-    ] = "true",
+        Literal["true", "none"],
+        typer.Option(help="Whether refine is given the true mask (drawn from the annotation).", rich_help_panel=STAGE),
+    ] = "none",
     noise: Annotated[
         str,
-        typer.Option(metavar="DEG,X,Y,Z", help="Refine: standard deviations, degrees and cm.", rich_help_panel=STAGE),
+        typer.Option(
+            metavar="DEG,X,Y,Z",
+            help="refine: standard deviations of the disturbance, in degrees and cm.",
+            rich_help_panel=STAGE,
+        ),
     ] = "15,1,1,5",
-    csv: Annotated[Path | None, typer.Option(metavar="FILE", help="Score: BOP results.", rich_help_panel=STAGE)] = None,
+    csv: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="score: a file of poses in BOP's format.", rich_help_panel=STAGE)
+    ] = None,
     vsd: Annotated[
-        bool, typer.Option("--vsd/--no-vsd", help="VSD, where there is depth.", rich_help_panel=STAGE)
+        bool,
+        typer.Option("--vsd/--no-vsd", help="Compute BOP's VSD, where the data set has depth.", rich_help_panel=STAGE),
     ] = True,
     preset: PresetOption = "lite",
     weights: WeightsOption = None,
@@ -97,33 +136,52 @@ def evaluate(
     colour_edge: ColourEdgeOption = True,
     seed: Annotated[
         int,
-        typer.Option(help="Of the refine stage's disturbances, and of --compare's bootstrap.", rich_help_panel=STAGE),
+        typer.Option(help="Random seed of refine's disturbances and of --compare.", rich_help_panel=STAGE),
     ] = 0,
-    threads: Annotated[int, typer.Option(min=1, help="Of torch, in each worker.", rich_help_panel=LOOP)] = 1,
+    threads: Annotated[
+        int, typer.Option(min=1, help="CPU threads for torch in each process.", rich_help_panel=LOOP)
+    ] = 1,
     device: DeviceOption = "auto",
-    workers: Annotated[int, typer.Option(min=1, help="Processes.", rich_help_panel=LOOP)] = 1,
+    workers: Annotated[int, typer.Option(min=1, help="Number of processes.", rich_help_panel=LOOP)] = 1,
     out: Annotated[
         Path | None,
         typer.Option(
-            metavar="DIR", help="Folder for the results; the same run in it is continued.", rich_help_panel=OUTPUT
+            metavar="DIR",
+            help="Folder for the results; an interrupted run of the same command is continued.",
+            rich_help_panel=OUTPUT,
         ),
     ] = None,
     force: Annotated[
-        bool, typer.Option("--force", help="Delete an evaluation in that folder.", rich_help_panel=OUTPUT)
+        bool,
+        typer.Option(
+            "--force", help="Start anew where --out holds another evaluation, which is deleted.", rich_help_panel=OUTPUT
+        ),
     ] = False,
     comparison: Annotated[
         tuple[Path, Path] | None,
-        typer.Option("--compare", metavar="A B", help="Two result folders side by side.", rich_help_panel=OUTPUT),
+        typer.Option(
+            "--compare",
+            metavar="A B",
+            help="Compare two result folders, with confidence intervals; nothing is measured.",
+            rich_help_panel=OUTPUT,
+        ),
     ] = None,
+    json: JsonOption = None,
 ) -> None:
     """Measure poses as the field does: tables, results.json, a BOP CSV and an HTML report.
 
     A killed run continues when the same command is given again.
     """
+    from posekit.cli.output import check_json, write_json
+
+    check_json(json)
+    apart = json == "-"  # standard output is for JSON alone
     if comparison is not None:
         from posekit.evaluate import compare
 
-        _print_comparison(compare(*comparison, seed=seed))
+        found = compare(*comparison, seed=seed)
+        _print_comparison(found, apart)
+        write_json(json, dumps(asdict(found), indent=1) + "\n")
         return
     from posekit.estimate.estimator import EstimateOptions
     from posekit.evaluate import EvalOptions
@@ -161,9 +219,10 @@ def evaluate(
             options, folder, command=_command(), csv=csv, force=force, with_vsd=vsd,
             progress=lambda done, every: update_bar(completed=done, total=every),
         )  # fmt: skip
-    _print_results(outcome.results)
+    _print_results(outcome.results, apart)
     for path in outcome.files:
-        typer.echo(f"{path}")
+        typer.echo(f"{path}", err=apart)
+    write_json(json, dumps(outcome.results, indent=1, allow_nan=False) + "\n")
 
 
 def _command() -> str:
@@ -218,13 +277,16 @@ _HEADS = {"2deg_2cm": "(2,2)", "5deg_5cm": "(5,5)", "10deg_10cm": "(10,10)", "5d
           "vsd_ar": "VSD", "mssd_ar": "MSSD", "mspd_ar": "MSPD", "ar": "AR", "ap": "AP"}  # fmt: skip
 
 
-def _print_results(results: Mapping[str, Any]) -> None:
-    from rich.console import Console
+def _print_results(results: Mapping[str, Any], apart: bool) -> None:
+    """apart: on standard error."""
     from rich.table import Table
 
+    from posekit.evaluate.table import TRUE_MASKS
+
+    say = partial(typer.echo, err=apart)
     data, counts, weights = results["dataset"], results["counts"], results["weights"]
     shown = [m for m in _SHOWN if m in results["mean"]]
-    table = Table(title=f"{data['title']}: {results['stage']}, percent", title_justify="left")
+    table = Table(title=f"{results['title']}, percent", title_justify="left")
     table.add_column("object")
     for head in ("training", "n", "missing", *(_HEADS[m] for m in shown)):
         table.add_column(head, justify="right")
@@ -236,31 +298,35 @@ def _print_results(results: Mapping[str, Any]) -> None:
     for name, values in (("mean over objects", results["mean"]), ("over all instances", results["pooled"])):
         cells = [f"{values[m]:.1f}" if m in values else "" for m in shown]
         table.add_row(name, "", str(counts["instances"]), str(counts["missing"]), *cells)
-    console = Console(width=None if Console().is_terminal else 160)
-    console.print(table)
-    _say(
-        f"instances: {data['instances']}; s: with symmetries; AR is BOP's over all instances, AP its mean over objects"
-    )
+    _show(table, apart)
+    say(f"instances: {data['instances']}; s: with symmetries; AR is BOP's over all instances, AP its mean over objects")
+    if results["true_masks"]:
+        say(TRUE_MASKS)
     if data["masks"].get("rendered"):
-        _say(f"visible masks: {data['masks']['rendered']} of {counts['instances']} rendered from the ground truth")
+        say(f"visible masks: {data['masks']['rendered']} of {counts['instances']} rendered from the ground truth")
     if data["split_list"]:
-        _say(f"split: {data['split_list']}, hash {data['split_hash']}")
+        say(f"split: {data['split_list']}, hash {data['split_hash']}")
     for kind, value in (results.get("detection_ap") or {}).items():
-        _say(f"{kind}: {'none' if value is None else f'{value:.1f}'}")
+        say(f"{kind}: {'none' if value is None else f'{value:.1f}'}")
     seconds = results["seconds_per_instance"]
     if seconds["median"] is not None:
-        _say(f"{seconds['median']:.2f} s per instance in the median, {seconds['mean']:.2f} in the mean; "
+        say(f"{seconds['median']:.2f} s per instance in the median, {seconds['mean']:.2f} in the mean; "
              f"weights {weights['hash']}; commit {results['commit']}; {results['machine']}")  # fmt: skip
     if data["name"] == "linemod":
-        _print_paper(results)
+        _print_paper(results, apart)
 
 
-def _say(text: str) -> None:
-    typer.echo(text)
-
-
-def _print_paper(results: Mapping[str, Any]) -> None:
+def _show(table: Table, apart: bool, width: int = 160) -> None:
+    """width: where the output is no terminal, characters."""
     from rich.console import Console
+
+    console = Console(stderr=apart)
+    if not console.is_terminal:
+        console = Console(stderr=apart, width=width)
+    console.print(table)
+
+
+def _print_paper(results: Mapping[str, Any], apart: bool) -> None:
     from rich.table import Table
 
     from posekit.evaluate.table import PAPER_MEASURES, paper_table
@@ -271,13 +337,13 @@ def _print_paper(results: Mapping[str, Any]) -> None:
         table.add_column(head, justify="right")
     for name, values in paper_table(results):
         table.add_row(name, *("-" if (v := values[m]) is None else f"{v:.1f}" for m in PAPER_MEASURES))
-    Console(width=None if Console().is_terminal else 160).print(table)
+    _show(table, apart)
 
 
-def _print_comparison(found: Comparison) -> None:
-    from rich.console import Console
+def _print_comparison(found: Comparison, apart: bool) -> None:
     from rich.table import Table
 
+    say = partial(typer.echo, err=apart)
     table = Table(title=f"{found.instances} instances in both, mean over objects, percent", title_justify="left")
     table.add_column("measure")
     for head in ("A", "B", "B - A", "95 % interval"):
@@ -286,9 +352,9 @@ def _print_comparison(found: Comparison) -> None:
         mark = " *" if d.clear else ""
         interval = f"{d.low:+.1f} to {d.high:+.1f}{mark}"
         table.add_row(d.measure, f"{d.a:.1f}", f"{d.b:.1f}", f"{d.difference:+.1f}", interval)
-    Console(width=None if Console().is_terminal else 120).print(table)
-    _say("interval: paired bootstrap over instances within each object; *: it leaves out zero")
+    _show(table, apart, 120)
+    say("interval: paired bootstrap over instances within each object; *: it leaves out zero")
     if found.only_a or found.only_b:
-        _say(f"left out: {found.only_a} instances only in A, {found.only_b} only in B")
+        say(f"left out: {found.only_a} instances only in A, {found.only_b} only in B")
     for note in found.notes:
-        _say(f"differs: {note}")
+        say(f"differs: {note}")

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from posekit.cli.messages import working
 from posekit.cli.options import NOT_RELIABLE
 from posekit.errors import OutputError
 from posekit.geometry import rotation_angle
@@ -82,34 +83,63 @@ def _occupied(folder: Path) -> bool:
         raise OutputError(f"the output folder {folder} cannot be read: {error.strerror}.") from error
 
 
+def check_json(json: str | None) -> None:
+    """Whether ``--json`` can be written. Raises OutputError."""
+    if json is None or json == "-":
+        return
+    if Path(json).is_dir():
+        raise OutputError(f"--json {json} is a folder: give a file, or - for standard output.")
+    if not Path(json).parent.is_dir():
+        raise OutputError(f"--json {json}: there is no folder {Path(json).parent}. Make it first.")
+    check_writable(Path(json).parent, f"--json {json} cannot be written")
+
+
+def write_json(json: str | None, text: str) -> None:
+    """A document where ``--json`` asks for it: nowhere, on standard output (-) or in a file."""
+    if json == "-":
+        typer.echo(text, nl=False)
+    elif json is not None:
+        write_text_atomic(Path(json), text)
+        typer.echo(f"JSON: {json}")
+
+
 @dataclass(frozen=True)
 class Destination:
     """What ``--out``, ``--force`` and ``--json`` ask for, checked before any work is done.
 
     json: None, "-" or a file. With ``--json`` and no ``--out`` no folder is written. formats: of further files with
-    the poses.
+    the poses. recording: the name of a recording for Rerun, None for none.
     """
 
     folder: OutputFolder | None
     json: str | None
     formats: tuple[str, ...] = ()
+    recording: str | None = None
 
     @classmethod
     def chosen(
-        cls, out: Path | None, default: Path, force: bool, json: str | None, formats: Sequence[str] = ()
+        cls,
+        out: Path | None,
+        default: Path,
+        force: bool,
+        json: str | None,
+        formats: Sequence[str] = (),
+        recording: str | None = None,
     ) -> Destination:
-        if json is not None and json != "-":
-            if Path(json).is_dir():
-                raise OutputError(f"--json {json} is a folder: give a file, or - for standard output.")
-            if not Path(json).parent.is_dir():
-                raise OutputError(f"--json {json}: there is no folder {Path(json).parent}. Make it first.")
-            check_writable(Path(json).parent, f"--json {json} cannot be written")
+        """Raises OutputError where something cannot be written there, ConfigError for an unknown format."""
+        check_json(json)
         check_formats(formats)
         if out is None and json is not None:
             if set(formats) - {"json"}:
                 raise OutputError(f"--format {formats[0]} with --json writes into a folder: pass --out DIR too.")
+            if recording is not None:
+                raise OutputError("--rerun with --json writes into a folder: pass --out DIR too.")
             return cls(None, json)
-        return cls(OutputFolder.chosen(out, default, force), json, tuple(formats))
+        if recording is not None:
+            from posekit.visualise.recording import load_rerun
+
+            load_rerun()
+        return cls(OutputFolder.chosen(out, default, force), json, tuple(formats), recording)
 
     def say(self, text: str) -> None:
         """Tell the person something; on standard error where standard output is for JSON."""
@@ -118,9 +148,7 @@ class Destination:
     @contextmanager
     def working(self, what: str) -> Iterator[None]:
         """Show what is being done, on a terminal only."""
-        from rich.console import Console
-
-        with Console(stderr=True).status(f"{what} ..."):
+        with working(what):
             yield
 
     def deliver(
@@ -130,9 +158,10 @@ class Destination:
         estimates: Sequence[Estimate],
         files: Mapping[str, Path],
         blend: float = 0.0,
+        symmetry: str | None = "none",
     ) -> None:
         """`deliver_all` of one mesh. files: what they were made from, by name, for the result."""
-        self.deliver_all(view, [(estimator, estimates)], [files], blend)
+        self.deliver_all(view, [(estimator, estimates)], [files], blend, symmetry)
 
     def deliver_all(
         self,
@@ -140,17 +169,19 @@ class Destination:
         results: Sequence[tuple[PoseEstimator, Sequence[Estimate]]],
         files: Sequence[Mapping[str, Path]],
         blend: float = 0.0,
+        symmetry: str | None = "none",
     ) -> None:
         """Print the estimates and write them: one result as JSON, and one overlay. files: by mesh. blend: how much of
-        the rendered meshes the overlay shows."""
+        the rendered meshes the overlay shows. symmetry: what was said of the meshes, None where nothing was."""
         from posekit.api import result_json
 
-        for estimator, estimates in results:
+        for (estimator, estimates), made_from in zip(results, files, strict=True):
             for estimate in estimates:
                 self.say(describe(estimate))
             if not estimates:
                 self.say(f"{estimator.model.name} not found: no pose.")
-            for note in limits(estimator.model, estimates):
+            seen = _unstated_symmetry(estimator, made_from["mesh"]) if estimates and symmetry is None else "none"
+            for note in limits(estimator.model, estimates, seen):
                 log.info(note)
         about: dict[str, object] = dict(files[0])
         if len(files) > 1:
@@ -163,11 +194,17 @@ class Destination:
             for format_ in dict.fromkeys(self.formats):
                 for name, text in pose_files(format_, [named_pose(each) for each in found]).items():
                     self.say(f"{format_}: {self.folder.write(name, text)}")
-        if self.json == "-":
-            typer.echo(result, nl=False)
-        elif self.json is not None:
-            write_text_atomic(Path(self.json), result)
-            self.say(f"result: {self.json}")
+            if self.recording is not None:
+                from posekit.visualise.recording import record_estimates
+
+                shown = [(estimator.model, each) for estimator, estimates in results for each in estimates]
+                record_estimates(self.folder.path / self.recording, view, shown)
+                self.say(f"recording: {self.folder.path / self.recording}")
+        self.write_json(result)
+
+    def write_json(self, text: str) -> None:
+        """Where ``--json`` asks for it."""
+        write_json(self.json, text)
 
 
 def _overlay(view: View, results: Sequence[tuple[PoseEstimator, Sequence[Estimate]]], blend: float) -> bytes:
@@ -206,9 +243,25 @@ def named_pose(estimate: Estimate, frame: int = 0, seconds: float | None = None)
     )
 
 
-def limits(model: ObjectModel, estimates: Sequence[Estimate]) -> list[str]:
-    """What the mesh and the picture do not allow, each once, with what helps."""
+def _unstated_symmetry(estimator: PoseEstimator, mesh: Path) -> str:
+    """The symmetry that a mesh has by the looks of it and nobody told; "none" without one."""
+    from posekit.datasets.symmetry import declared, detected_symmetry
+
+    model = estimator.model
+    return "none" if model.symmetries or declared(mesh) else detected_symmetry(estimator.renderer, model)
+
+
+def limits(model: ObjectModel, estimates: Sequence[Estimate], symmetry: str = "none") -> list[str]:
+    """What the mesh and the picture do not allow, each once, with what helps. symmetry: that nobody told, as
+    ``--symmetry`` takes it."""
     notes = []
+    if estimates and symmetry != "none":
+        from posekit.datasets.symmetry import in_words
+
+        notes.append(
+            f"{model.name} looks the same after {in_words(symmetry)}, so that several poses fit equally well and any "
+            f"of them may be given: pass --symmetry {symmetry} to have it considered, or --symmetry none."
+        )
     if estimates and model.colors is None and model.texture is None:
         notes.append(
             f"{model.name} has no colours: only its shape is compared, and a turn that leaves the silhouette as it is "

@@ -27,6 +27,7 @@ from posekit.cli.options import (
     PerturbOption,
     PresetOption,
     RequireReliableOption,
+    RerunOption,
     StopAngleOption,
     StopOption,
     SymmetryOption,
@@ -73,17 +74,19 @@ def refine(
     json: JsonOption = None,
     blend: BlendOption = 0.0,
     format_: FormatOption = None,
+    rerun: RerunOption = False,
     require_reliable: RequireReliableOption = False,
 ) -> None:
     """Refine a pose that is roughly known; a mask or a box helps, but neither is needed."""
     from posekit.cli.output import Destination, end_unless_reliable
 
-    destination = Destination.chosen(out, Path("posekit-out") / f"{image.stem}-refined", force, json, format_ or ())
+    default, recording = Path("posekit-out") / f"{image.stem}-refined", "refine.rrd" if rerun else None
+    destination = Destination.chosen(out, default, force, json, format_ or (), recording)
 
+    from posekit.cli.meshes import load_meshes
     from posekit.cli.prompts import detector_for
     from posekit.estimate.estimator import EstimateOptions, PoseEstimator
     from posekit.io.load import load_pose, load_view
-    from posekit.mesh.model import ObjectModel
 
     use_threads(threads)
     options = EstimateOptions(
@@ -97,7 +100,7 @@ def refine(
     )
     start = load_pose(pose)
     view = load_view(image, camera)
-    mesh = ObjectModel.load(model, units=units, symmetry=symmetry)
+    [mesh] = load_meshes([model], units, symmetry)
     if box is not None or mask is not None:
         [detection] = detector_for(box, mask, mask_from, view.lens).detect(view, [mesh])
         view = view.with_mask(detection.mask)
@@ -105,6 +108,6 @@ def refine(
         estimator = PoseEstimator(mesh, preset=preset, weights=weights, options=options, device=device)
     with destination.working("refining"):
         refined = estimator.refine(view, start)
-    destination.deliver(estimator, view, [refined], {"image": image, "mesh": model}, blend)
+    destination.deliver(estimator, view, [refined], {"image": image, "mesh": model}, blend, symmetry)
     if require_reliable:
         end_unless_reliable([refined])

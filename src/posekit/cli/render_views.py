@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
+from json import dumps
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from posekit.cli.options import ForceOption, ModelOption, UnitsOption, parse_size
+from posekit.cli.options import ForceOption, JsonOption, ModelOption, UnitsOption, parse_size
 from posekit.errors import ConfigError
 
 _BATCH = 16  # views in memory at a time
@@ -18,16 +18,22 @@ _THUMBNAIL = 240  # pixels, longer side of a picture in the contact sheet
 
 def render_views(
     model: ModelOption,
-    views: Annotated[int, typer.Option(help="6: the faces of a cube; else evenly over the sphere.")] = 6,
+    views: Annotated[
+        int,
+        typer.Option(help="Number of views: 6 are along the axes, any other number is spread evenly over the sphere."),
+    ] = 6,
     out: Annotated[
         Path | None,
         typer.Option(
-            metavar="DIR", help="New or empty. By default posekit-out/MESH-views, or posekit-out-2 and so on."
+            metavar="DIR",
+            help="Folder for the views, new or empty. Default: posekit-out/MESH-views, or posekit-out-2/MESH-views "
+            "and so on.",
         ),
     ] = None,
-    size: Annotated[str, typer.Option(metavar="WxH", help="Of each view, pixels.")] = "640x480",
+    size: Annotated[str, typer.Option(metavar="WxH", help="Width and height of each view, pixels.")] = "640x480",
     units: UnitsOption = "auto",
     force: ForceOption = False,
+    json: JsonOption = None,
 ) -> None:
     """Render a mesh from all sides: RGB, masks, a contact sheet, and each view's camera and pose."""
     shape = parse_size(size)
@@ -35,12 +41,13 @@ def render_views(
         raise ConfigError(f"--views {views}: from 1 to {_MOST_VIEWS} can be drawn.")
 
     from posekit.camera import Camera
-    from posekit.cli.output import OutputFolder
+    from posekit.cli.output import OutputFolder, check_json, write_json
     from posekit.mesh.model import ObjectModel
     from posekit.render import Renderer, centred_poses, render_views, view_rotations
     from posekit.render.views import DEFAULT_FOV
     from posekit.visualise import draw
 
+    check_json(json)
     folder = OutputFolder.chosen(out, Path("posekit-out") / f"{model.stem}-views", force)
     mesh = ObjectModel.load(model, units=units)
     renderer = Renderer(samples=4)
@@ -64,9 +71,11 @@ def render_views(
         for k, pose in enumerate(centred_poses(mesh, rotations, camera))
     ]
     about = {"mesh": str(model), "camera": {"K": camera.K.tolist(), "width": camera.width, "height": camera.height}}
-    folder.write("views.json", json.dumps({**about, "views": entries}, indent=1) + "\n")
+    text = dumps({**about, "views": entries}, indent=1) + "\n"
+    folder.write("views.json", text)
     sheet = draw.grid(thumbnails, captions=[str(k) for k in range(views)])
-    typer.echo(f"{views} views and {folder.write('contact_sheet.png', draw.png(sheet))}")
+    typer.echo(f"{views} views and {folder.write('contact_sheet.png', draw.png(sheet))}", err=json == "-")
+    write_json(json, text)
 
 
 def _thumbnail_size(size: tuple[int, int]) -> tuple[int, int]:

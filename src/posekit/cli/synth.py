@@ -16,61 +16,97 @@ PER_OBJECT, DEFAULT = 5000, 1000  # images, the paper's for each object (section
 
 
 def synth(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the data set; it must be new or empty.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the data set, new or empty.")],
     models: Annotated[
         list[Path] | None,
-        typer.Option(metavar="DIR|FILE", help="Meshes; repeat it, or name more behind it.", rich_help_panel=WHAT),
+        typer.Option(
+            metavar="DIR|FILE",
+            help="Mesh or folder of meshes; repeat the option, or list more meshes after the options.",
+            rich_help_panel=WHAT,
+        ),
     ] = None,
-    more: Annotated[list[Path] | None, typer.Argument(metavar="[MESH]...", help="More meshes.")] = None,
+    more: Annotated[
+        list[Path] | None, typer.Argument(metavar="[MESH]...", help="Further meshes, beside --models.")
+    ] = None,
     kind: Annotated[
-        Literal["randomised", "photoreal", "scenes", "sequence"], typer.Option(help="Of images.", rich_help_panel=WHAT)
+        Literal["randomised", "photoreal", "scenes", "sequence"],
+        typer.Option(
+            help="Kind of images: randomised (objects before backgrounds), scenes (objects that lie together), "
+            "sequence (videos), photoreal (path-traced rooms).",
+            rich_help_panel=WHAT,
+        ),
     ] = "randomised",
     images: Annotated[
         int | None,
         typer.Option(
-            min=1, help="In all; by default 5000 for each object (randomised), else 1000.", rich_help_panel=WHAT
+            min=1,
+            help="Number of images in all. Default: 5000 for each object (randomised), else 1000.",
+            rich_help_panel=WHAT,
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(help="The same seed gives the same data set.", rich_help_panel=WHAT)] = 0,
-    units: Annotated[Units, typer.Option(help="Of the meshes.", rich_help_panel=WHAT)] = "auto",
+    seed: Annotated[
+        int, typer.Option(help="Random seed; the same one gives the same data set.", rich_help_panel=WHAT)
+    ] = 0,
+    units: Annotated[
+        Units,
+        typer.Option(help="Length unit of the meshes' coordinates; auto decides by their size.", rich_help_panel=WHAT),
+    ] = "auto",
     symmetry: Annotated[
         str,
         typer.Option(
             metavar="detect|none|TEXT",
-            help="Of meshes that no models_info.json beside them describes; TEXT as z:2 or z:inf.",
+            help="Symmetries of meshes without a models_info.json beside them: detect them, none, or as z:2 or z:inf.",
             rich_help_panel=WHAT,
         ),
     ] = "detect",
-    split: Annotated[str, typer.Option(help="The folder of the scenes.", rich_help_panel=WHAT)] = "train",
+    split: Annotated[str, typer.Option(help="Name of the folder for the scenes.", rich_help_panel=WHAT)] = "train",
     shards: Annotated[
-        int, typer.Option(min=0, metavar="IMAGES", help="Write WebDataset shards too.", rich_help_panel=WHAT)
+        int,
+        typer.Option(
+            min=0,
+            metavar="IMAGES",
+            help="Also write WebDataset shards of so many images each; 0: none.",
+            rich_help_panel=WHAT,
+        ),
     ] = 0,
-    size: Annotated[str, typer.Option(metavar="WxH", help="Of the images, pixels.", rich_help_panel=LOOK)] = "640x480",
-    quality: Annotated[int, typer.Option(help="Of JPEG, percent; 0 writes PNG.", rich_help_panel=LOOK)] = 95,
+    size: Annotated[
+        str, typer.Option(metavar="WxH", help="Width and height of the images, pixels.", rich_help_panel=LOOK)
+    ] = "640x480",
+    quality: Annotated[int, typer.Option(help="JPEG quality, percent; 0 writes PNG.", rich_help_panel=LOOK)] = 95,
     backgrounds: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Photographs, or Pascal VOC; else procedural.", rich_help_panel=LOOK),
+        typer.Option(
+            metavar="DIR",
+            help="Folder of photographs, or Pascal VOC, for the backgrounds. Default: procedural ones.",
+            rich_help_panel=LOOK,
+        ),
     ] = None,
     hdri: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Environments (.exr, .hdr) of photoreal.", rich_help_panel=LOOK)
+        Path | None,
+        typer.Option(metavar="DIR", help="photoreal: folder of environment maps (.exr, .hdr).", rich_help_panel=LOOK),
     ] = None,
-    frames: Annotated[int, typer.Option(help="Of a sequence.", rich_help_panel=LOOK)] = 100,
+    frames: Annotated[int, typer.Option(help="sequence: frames of each video.", rich_help_panel=LOOK)] = 100,
     motion: Annotated[
         Literal["mixed", "still", "slow", "smooth", "fast", "jerky", "hidden", "leaving"],
-        typer.Option(help="Of sequences; mixed: each in its turn.", rich_help_panel=LOOK),
+        typer.Option(help="sequence: how objects and camera move; mixed takes each in turn.", rich_help_panel=LOOK),
     ] = "mixed",
-    views: Annotated[int, typer.Option(help="Of a photoreal room.", rich_help_panel=LOOK)] = 4,
-    samples: Annotated[int, typer.Option(help="Light paths per pixel of photoreal.", rich_help_panel=LOOK)] = 32,
+    views: Annotated[int, typer.Option(help="photoreal: views of each room.", rich_help_panel=LOOK)] = 4,
+    samples: Annotated[int, typer.Option(help="photoreal: light paths for each pixel.", rich_help_panel=LOOK)] = 32,
     variant: Annotated[
-        str, typer.Option(help="Mitsuba's; auto takes the fastest one here.", rich_help_panel=MACHINE)
+        str,
+        typer.Option(
+            help="photoreal: Mitsuba's variant; auto takes the fastest that works here.", rich_help_panel=MACHINE
+        ),
     ] = "auto",
-    workers: Annotated[int, typer.Option(help="Processes on this machine.", rich_help_panel=MACHINE)] = 1,
+    workers: Annotated[int, typer.Option(help="Number of processes on this machine.", rich_help_panel=MACHINE)] = 1,
     ray: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS|local", help="A Ray cluster that shares the folder.", rich_help_panel=MACHINE),
+        typer.Option(
+            metavar="ADDRESS|local", help="Use a Ray cluster whose machines share the folder.", rich_help_panel=MACHINE
+        ),
     ] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with the data set in --out, as it was begun.")
+        bool, typer.Option("--resume", help="Continue the data set in --out with the settings it was begun with.")
     ] = False,
 ) -> None:
     """Make a data set of your meshes: images, depth, masks and poses in BOP layout."""

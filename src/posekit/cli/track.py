@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import IO, TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -22,10 +21,12 @@ from posekit.cli.options import (
     DeviceOption,
     ForceOption,
     FormatOption,
+    JsonOption,
     ModelsOption,
     OutOption,
     PresetOption,
     RequireReliableOption,
+    RerunOption,
     SymmetryOption,
     ThreadsOption,
     UnitsOption,
@@ -35,71 +36,94 @@ from posekit.cli.options import (
 from posekit.cli.progress import progress_bar
 
 if TYPE_CHECKING:
+    from posekit.cli.output import Destination
     from posekit.io.pose_formats import NamedPose
     from posekit.io.video import Frame, Frames, VideoWriter
     from posekit.tracking.tracker import Tracked, Tracker
 
+RECORDING = "track.rrd"
 COLUMNS = "scene_id,im_id,obj_id,score,R,t,time"
 
 
 def track(
     source: Annotated[
-        str, typer.Argument(help="A video, a folder or glob of pictures, a BOP scene, or a camera's number.")
+        str,
+        typer.Argument(
+            metavar="SOURCE",
+            help="A video file, a folder or glob of pictures, a BOP scene, or the number of a camera (0).",
+        ),
     ],
     model: ModelsOption,
     camera: CameraOption = None,
     pose: Annotated[
         list[Path] | None,
-        typer.Option(metavar="FILE", help="First pose, as refine takes it; once for each mesh.", rich_help_panel=INPUT),
+        typer.Option(
+            metavar="FILE",
+            help="Pose in the first frame, in a file as refine --pose takes it; one for each --model, in the same "
+            "order. Default: the object is detected.",
+            rich_help_panel=INPUT,
+        ),
     ] = None,
     detector: DetectorOption = None,
     units: UnitsOption = "auto",
     symmetry: SymmetryOption = None,
     preset: PresetOption = "lite",
     weights: WeightsOption = None,
-    iterations: Annotated[int, typer.Option(help="Comparisons of a frame at most.", rich_help_panel=LOOP)] = 1,
+    iterations: Annotated[
+        int, typer.Option(help="Largest number of network passes for each frame.", rich_help_panel=LOOP)
+    ] = 1,
     restart_angle: Annotated[
-        float, typer.Option(metavar="DEGREES", help="Predicted angle that restarts.", rich_help_panel=LOOP)
+        float,
+        typer.Option(
+            metavar="DEGREES",
+            help="Predicted rotation error above which the object is detected anew.",
+            rich_help_panel=LOOP,
+        ),
     ] = 25.0,
     still_angle: Annotated[
         float,
         typer.Option(
             metavar="DEGREES",
-            help="Predicted angle below which the network leaves the pose as it is; the paper has 2.",
+            help="Predicted rotation error below which the network does not move the pose (the paper: 2).",
             rich_help_panel=LOOP,
         ),
     ] = 0.0,
     runtime: Annotated[
-        Literal["openvino", "torch"], typer.Option(help="Of the network.", rich_help_panel=LOOP)
+        Literal["openvino", "torch"], typer.Option(help="Library that runs the network.", rich_help_panel=LOOP)
     ] = "openvino",
     threads: ThreadsOption = None,
     device: DeviceOption = "auto",
-    overlay: Annotated[bool, typer.Option(help="Write overlay.mp4.", rich_help_panel=OUTPUT)] = True,
-    rerun: Annotated[
-        bool, typer.Option("--rerun", help="Write track.rrd for the Rerun viewer.", rich_help_panel=OUTPUT)
-    ] = False,
+    overlay: Annotated[
+        bool, typer.Option(help="Write a video with the poses drawn in, overlay.mp4.", rich_help_panel=OUTPUT)
+    ] = True,
+    rerun: RerunOption = False,
     live: Annotated[
-        bool, typer.Option("--live", help="Drop frames to keep up with a camera.", rich_help_panel=OUTPUT)
+        bool,
+        typer.Option(
+            "--live", help="For cameras: skip frames that come while one is worked on.", rich_help_panel=OUTPUT
+        ),
     ] = False,
-    frames: Annotated[int | None, typer.Option(min=1, help="Frames at most.", rich_help_panel=OUTPUT)] = None,
+    frames: Annotated[
+        int | None, typer.Option(min=1, help="Stop after so many frames.", rich_help_panel=OUTPUT)
+    ] = None,
     out: OutOption = None,
     force: ForceOption = False,
+    json: JsonOption = None,
     format_: FormatOption = None,
     require_reliable: RequireReliableOption = False,
 ) -> None:
     """Follow objects through a video: poses as they come, and an overlay to look at."""
-    from posekit.cli.output import OutputFolder
-    from posekit.io.pose_formats import check_formats, pose_files
-
-    check_formats(format_ or ())
-
-    folder = OutputFolder.chosen(out, Path("posekit-out") / f"{Path(source).stem or 'camera'}-track", force)
-
+    from posekit.cli.meshes import load_meshes
+    from posekit.cli.output import Destination
     from posekit.errors import ImageError, PromptError
+    from posekit.io.pose_formats import pose_files
+
+    default = Path("posekit-out") / f"{Path(source).stem or 'camera'}-track"
+    destination = Destination.chosen(out, default, force, json, format_ or (), RECORDING if rerun else None)
+
     from posekit.estimate.estimator import Estimators
     from posekit.io.load import load_pose
     from posekit.io.video import ReadAhead, open_frames
-    from posekit.mesh.model import ObjectModel
     from posekit.tracking.tracker import TrackConfig, Tracker
 
     if pose and len(pose) != len(model):
@@ -107,7 +131,7 @@ def track(
     use_threads(threads)
     config = TrackConfig(restart_angle, still_angle, iterations=iterations, runtime=runtime)
     starts = [load_pose(path) for path in pose] if pose else [None] * len(model)
-    meshes = [ObjectModel.load(path, units=units, symmetry=symmetry) for path in model]
+    meshes = load_meshes(model, units, symmetry)
     sequence = ReadAhead(open_frames(source, camera), latest=live)
     finder = None
     if not pose or detector is not None:
@@ -119,16 +143,17 @@ def track(
         Tracker(mesh, pose=start, detector=finder, config=config, estimator=estimators(mesh))
         for mesh, start in zip(meshes, starts, strict=True)
     ]
-    counts = _run(trackers, sequence, folder, overlay, rerun, frames, keep=bool(format_))
-    for kind in dict.fromkeys(format_ or ()):
-        for name, text in pose_files(kind, counts.poses).items():
-            counts.files.append(folder.write(name, text).name)
-    typer.echo(f"reliable: {counts.reliable} of {counts.used * len(trackers)} poses")
-    typer.echo(", ".join(f"{count} {state}" for state, count in counts.states.items()))
+    counts = _run(trackers, sequence, destination, overlay, frames, keep=bool(format_))
+    if destination.folder is not None:
+        for kind in dict.fromkeys(format_ or ()):
+            for name, text in pose_files(kind, counts.poses).items():
+                counts.files.append(destination.folder.write(name, text))
+    destination.say(f"reliable: {counts.reliable} of {counts.used * len(trackers)} poses")
+    destination.say(", ".join(f"{count} {state}" for state, count in counts.states.items()))
     if counts.problems:
         typer.echo(f"{len(counts.problems)} frames could not be used; the first: {counts.problems[0]}", err=True)
-    for name in counts.files:
-        typer.echo(f"wrote: {folder.path / name}")
+    for path in counts.files:
+        destination.say(f"wrote: {path}")
     if not counts.used:
         raise ImageError(
             f"not one frame of {source} could be used: {counts.problems[0] if counts.problems else 'it is empty'}."
@@ -149,15 +174,14 @@ class _Counts:
         self.states: dict[str, int] = {}
         self.problems: list[str] = []
         self.poses: list[NamedPose] = []
-        self.files: list[str] = ["poses.jsonl", "poses.csv"]
+        self.files: list[Path] = []
 
 
 def _run(
     trackers: Sequence[Tracker],
     sequence: Frames,
-    folder: Any,
+    destination: Destination,
     overlay: bool,
-    rerun: bool,
     most: int | None,
     *,
     keep: bool,
@@ -165,23 +189,18 @@ def _run(
     """Track every frame, and write each as soon as it is done: a killed run keeps its frames. keep: all poses, for
     formats that are written at the end."""
     from posekit.cli.output import named_pose
-    from posekit.errors import OutputError
-    from posekit.io.video import VideoWriter
 
-    counts = _Counts()
-    try:
-        folder.path.mkdir(parents=True, exist_ok=True)
-        lines, table = ((folder.path / name).open("w", encoding="utf-8", buffering=1) for name in counts.files)
-    except OSError as error:
-        raise OutputError(f"the folder {folder.path} cannot be written: {error.strerror}.") from error
-    with (
-        lines,
-        table,
-        VideoWriter(folder.path / "overlay.mp4", sequence.rate) as writer,
-        _recorder(folder.path / "track.rrd", trackers, rerun) as record,
-        _bar(sequence) as show,
-    ):
-        table.write(COLUMNS + "\n")
+    counts, folder = _Counts(), None if destination.folder is None else destination.folder.path
+    with ExitStack() as stack:
+        lines = _Lines(destination, stack, counts)
+        writer = record = None
+        if folder is not None and overlay:
+            from posekit.io.video import VideoWriter
+
+            writer = stack.enter_context(VideoWriter(folder / "overlay.mp4", sequence.rate))
+        if folder is not None and destination.recording is not None:
+            record = stack.enter_context(_recorder(folder / destination.recording, trackers))
+        show = stack.enter_context(_bar(sequence))
         for done, frame in enumerate(sequence):
             if most is not None and done >= most:
                 break
@@ -189,20 +208,53 @@ def _run(
             results = _step(trackers, frame, counts)
             seconds = time.perf_counter() - started
             for k, (tracker, result) in enumerate(zip(trackers, results, strict=True)):
-                lines.write(_line(frame, tracker.model.name, result) + "\n")
-                if result.estimate is not None:
-                    if keep:
-                        counts.poses.append(named_pose(result.estimate, frame.number, frame.seconds))
-                    table.write(_row(frame, _number(tracker.model.name, k), result, seconds) + "\n")
-            record(frame, results)
-            if overlay and frame.image is not None:
+                lines.write(frame, tracker.model.name, k, result, seconds)
+                if keep and result.estimate is not None:
+                    counts.poses.append(named_pose(result.estimate, frame.number, frame.seconds))
+            if record is not None:
+                record(frame, results)
+            if writer is not None and frame.image is not None:
                 _draw(writer, frame, trackers, results)
             show(seconds, results)
-    if overlay and counts.used:
-        counts.files.append("overlay.mp4")
-    if rerun:
-        counts.files.append("track.rrd")
+    if folder is not None:
+        counts.files += [folder / "overlay.mp4"] if overlay and counts.used else []
+        counts.files += [] if destination.recording is None else [folder / destination.recording]
     return counts
+
+
+class _Lines:
+    """Where each frame's poses go as soon as they are known: poses.jsonl and poses.csv in the folder, and what
+    ``--json`` names. Raises OutputError where they cannot be written."""
+
+    def __init__(self, destination: Destination, stack: ExitStack, counts: _Counts) -> None:
+        from posekit.errors import OutputError
+
+        self.table: IO[str] | None = None
+        self.files: list[IO[str]] = []
+        paths = [] if destination.json in (None, "-") else [Path(str(destination.json))]
+        self.aloud = destination.json == "-"
+        try:
+            if destination.folder is not None:
+                folder = destination.folder.path
+                folder.mkdir(parents=True, exist_ok=True)
+                paths.append(folder / "poses.jsonl")
+                counts.files.append(folder / "poses.csv")
+                self.table = stack.enter_context(counts.files[-1].open("w", encoding="utf-8", buffering=1))
+                self.table.write(COLUMNS + "\n")
+            self.files = [stack.enter_context(path.open("w", encoding="utf-8", buffering=1)) for path in paths]
+        except OSError as error:
+            raise OutputError(f"{error.filename} cannot be written: {error.strerror}.") from error
+        counts.files = [*reversed(paths), *counts.files]
+
+    def write(self, frame: Frame, name: str, k: int, result: Tracked, seconds: float) -> None:
+        """The k-th mesh in a frame."""
+        line = _line(frame, name, result)
+        for file in self.files:
+            file.write(line)
+        if self.aloud:
+            typer.echo(line, nl=False)
+        if self.table is not None and result.estimate is not None:
+            self.table.write(_row(frame, _number(name, k), result, seconds) + "\n")
 
 
 def _step(trackers: Sequence[Tracker], frame: Frame, counts: _Counts) -> list[Tracked]:
@@ -221,6 +273,8 @@ def _step(trackers: Sequence[Tracker], frame: Frame, counts: _Counts) -> list[Tr
 
 
 def _line(frame: Frame, name: str, result: Tracked) -> str:
+    from posekit.results import FRAME_SCHEMA, document_to_json
+
     pose, angle = result.T_cam_obj, result.angle
     entry: dict[str, Any] = {
         "frame": frame.number,
@@ -236,7 +290,7 @@ def _line(frame: Frame, name: str, result: Tracked) -> str:
         entry["seconds"] = frame.seconds
     if frame.problem:
         entry["problem"] = frame.problem
-    return json.dumps(entry, allow_nan=False)
+    return document_to_json(FRAME_SCHEMA, entry, indent=None)
 
 
 def _row(frame: Frame, obj_id: int, result: Tracked, seconds: float) -> str:
@@ -275,11 +329,8 @@ def _draw(writer: VideoWriter, frame: Frame, trackers: Sequence[Tracker], result
 
 
 @contextmanager
-def _recorder(path: Path, trackers: Sequence[Tracker], wanted: bool) -> Iterator[Any]:
+def _recorder(path: Path, trackers: Sequence[Tracker]) -> Iterator[Any]:
     """What is called with each frame and its results."""
-    if not wanted:
-        yield lambda *_: None
-        return
     from posekit.visualise.recording import Recorder
 
     with Recorder(path, [tracker.model for tracker in trackers]) as recorder:

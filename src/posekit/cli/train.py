@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from posekit.cli.messages import Command, Group
 from posekit.cli.options import (
     MACHINE,
     SCHEDULE,
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
     from posekit.train.config import TrainConfig
     from posekit.train.loop import Show
 
-train = typer.Typer(no_args_is_help=True, help="Train networks from meshes.")
+train = typer.Typer(cls=Group, no_args_is_help=True, help="Train networks from meshes.")
 
 
 @train.callback()
@@ -44,7 +45,7 @@ def _train() -> None:
     """Train networks from meshes."""
 
 
-@train.command("pose")
+@train.command("pose", cls=Command)
 def pose(
     out: TrainingOutOption,
     model: Annotated[
@@ -135,7 +136,7 @@ def pose(
         typer.echo(f"weights: {out}; use them with: posekit estimate --weights {out}")
 
 
-@train.command("angle")
+@train.command("angle", cls=Command)
 def angle(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the weights.")],
     weights: Annotated[
@@ -236,7 +237,7 @@ def _bar() -> Iterator[Show]:
         yield show
 
 
-@train.command("detector")
+@train.command("detector", cls=Command)
 def detector(
     out: TrainingOutOption,
     models: Annotated[

@@ -15,9 +15,10 @@ from posekit.camera import Box, mask_box
 from posekit.detect.prompts import clip_box
 from posekit.detect.segmentation import decode, encode, xywh
 from posekit.errors import PromptError
+from posekit.io.documents import camera_entry
 from posekit.io.files import read_text
 from posekit.mesh.model import ObjectModel
-from posekit.results import Detection, Source
+from posekit.results import DETECTIONS_SCHEMA, Detection, Source, check_schema, document_to_json
 from posekit.view import View
 
 log = logging.getLogger("posekit")
@@ -32,11 +33,13 @@ _FORMS = (
 
 @dataclass(frozen=True, eq=False)
 class DetectionsFile:
-    """A Detector that reads what another program found. entries: of one picture; names: of categories, by number."""
+    """A Detector that reads what another program, or `posekit detect`, found. entries: of one picture; names: of
+    categories, by number."""
 
     entries: Sequence[Mapping[str, Any]]
     names: Mapping[int, str]
     label: str
+    undistorted: bool = False  # whether boxes and masks are of the undistorted picture, as posekit's own are
 
     @classmethod
     def read(cls, path: Path, image: Path) -> DetectionsFile:
@@ -51,8 +54,10 @@ class DetectionsFile:
             data = json_lines(text) or json.loads(text)
         except (OSError, ValueError, RecursionError) as error:
             raise PromptError(f"the detections {path} cannot be read ({error}): give {_FORMS}.") from error
+        check_schema(data, str(path))
+        own = isinstance(data, dict) and data.get("schema") == DETECTIONS_SCHEMA
         try:
-            every, names, files = _parts(data)
+            every, names, files = _parts(_as_coco(data) if own and isinstance(data, dict) else data)
             entries = [e for k, e in enumerate(every) if _usable(e, k, path.name)]
         except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
             raise PromptError(f"{path} holds no detections ({error!r}): give {_FORMS}.") from error
@@ -60,7 +65,8 @@ class DetectionsFile:
             raise PromptError(f"{path} has {len(every)} entries and none that can be used: give {_FORMS}.")
         if not every:
             log.warning("%s holds no detections at all.", path.name)
-        return cls(_of_picture(_of_scene(entries, image, path.name), image, files, path.name), names, path.name)
+        here = _of_picture(_of_scene(entries, image, path.name), image, files, path.name)
+        return cls(here, names, path.name, own)
 
     def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
         """Each model's detections by falling score. A category belongs to the model of its name, or of its number
@@ -113,7 +119,8 @@ class DetectionsFile:
     def _detection(self, entry: Mapping[str, Any], view: View, model: ObjectModel, corners: bool) -> Detection:
         try:
             score = float(entry.get("score", 1.0))
-            taken = view.camera if view.lens is None else view.lens.camera
+            lens = None if self.undistorted else view.lens
+            taken = view.camera if lens is None else lens.camera
             mask = decode(entry["segmentation"], taken.size) if entry.get("segmentation") else None
             box = _box(entry["bbox"], corners) if entry.get("bbox") is not None else None
         except (KeyError, TypeError, ValueError, OverflowError) as error:
@@ -124,9 +131,9 @@ class DetectionsFile:
             box = mask_box(mask) if mask is not None else None
         if box is None or not math.isfinite(score):
             raise PromptError(f"{self.label} has a detection with neither box nor mask, or without a finite score.")
-        if view.lens is not None:
-            box = view.lens.undistorted_box(clip_box(box, taken))
-            mask = None if mask is None else view.lens.undistorted_mask(mask)
+        if lens is not None:
+            box = lens.undistorted_box(clip_box(box, taken))
+            mask = None if mask is None else lens.undistorted_mask(mask)
         return Detection(clip_box(box, view.camera), mask, score, model.name, Source.FILE)
 
 
@@ -151,6 +158,25 @@ def _parts(data: Any) -> tuple[list[Any], dict[int, str], dict[int, str]]:
     names = {int(c["id"]): str(c.get("name", "")) for c in data.get("categories", [])}
     files = {int(i["id"]): str(i.get("file_name", "")) for i in data.get("images", [])}
     return list(data["annotations"]), names, files
+
+
+def _as_coco(data: Mapping[str, Any]) -> dict[str, Any]:
+    """A document of `to_document` as COCO has it."""
+    labels = {name: k for k, name in enumerate(sorted({str(d["label"] or "") for d in data["detections"]}))}
+    return {
+        "images": [{"id": 0, "file_name": data.get("image", "")}],
+        "categories": [{"id": k, "name": name} for name, k in labels.items()],
+        "annotations": [
+            {
+                "image_id": 0,
+                "category_id": labels[str(d["label"] or "")],
+                "score": d["score"],
+                "bbox": xywh(tuple(d["box"])),
+                "segmentation": d["mask"],
+            }
+            for d in data["detections"]
+        ],
+    }
 
 
 def _usable(entry: Any, k: int, label: str) -> bool:
@@ -276,6 +302,22 @@ def to_bop(
     number = _image_number(image, {}) or 0
     entries = [{"scene_id": scene, **_entry(d, number, numbers), "time": seconds} for d in detections]
     return json.dumps(entries, indent=1, allow_nan=False) + "\n"
+
+
+def to_document(detections: Sequence[Detection], view: View, image: Path, seconds: float) -> str:
+    """posekit's own form (docs/result-json.md), best first. seconds: of the whole picture."""
+    entries = [
+        {
+            "box": list(d.box),
+            "score": d.score,
+            "label": d.label,
+            "source": d.source.value,
+            "mask": None if d.mask is None else encode(d.mask),
+        }
+        for d in sorted(detections, key=lambda d: -d.score)
+    ]
+    about = {"image": image, "camera": camera_entry(view), "seconds": seconds, "detections": entries}
+    return document_to_json(DETECTIONS_SCHEMA, about)
 
 
 def _entry(detection: Detection, image: int, numbers: Mapping[str, int]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -33,6 +34,7 @@ from posekit.view import View
 
 if TYPE_CHECKING:
     from posekit.nets.weights import Networks
+log = logging.getLogger("posekit")
 
 INITS = ("templates", "mvnet")
 AUTO = "auto"  # correspondences where the network gives them, else the regressed delta
@@ -129,6 +131,10 @@ class PoseEstimator:
             started = time.perf_counter()
             first = self.first_poses(view, detection)
             searched = time.perf_counter()
+            log.debug(
+                "%s: %d first poses in %.2f s, scores %s", self.model.name, len(first), searched - started,
+                " ".join(f"{h.score:.2f}" for h in first),
+            )  # fmt: skip
             if not first:
                 continue
             masked = view.with_mask(detection.mask)
@@ -178,7 +184,14 @@ class PoseEstimator:
         return self._continued(view, finalists, self.refine_options.iterations - PRUNING_ITERATIONS)
 
     def _best(self, scorer: EvidenceScorer, candidates: Sequence[Refinement], count: int) -> list[Refinement]:
-        order = np.argsort([-s for s in self._scores(scorer, candidates)], kind="stable")
+        scores = self._scores(scorer, candidates)
+        order = np.argsort([-s for s in scores], kind="stable")
+        for place, k in enumerate(order):
+            log.debug(
+                "%s: pose %d of %d%s: rank %.3f, expected rotation error %.1f degrees, %d iterations", self.model.name,
+                place + 1, len(order), "" if place < count else " (dropped)", scores[k],
+                np.rad2deg(candidates[k].angle), candidates[k].iterations,
+            )  # fmt: skip
         return [candidates[k] for k in order[:count]]
 
     def _continued(self, view: View, candidates: Sequence[Refinement], iterations: int) -> list[Refinement]:

@@ -31,9 +31,9 @@ class EvalOptions:
     images: tuple[tuple[int, int], ...] = ()  # (scene, image), all where empty
     limit: int | None = None  # that many pictures, spread evenly
     min_visible: float | None = None  # instances at least as visible, in [0, 1]; None is the test's own targets
-    detections: str = "gt-masks"  # one of GIVEN, DETECTOR or a JSON file
+    detections: str = "gt-boxes"  # one of GIVEN, DETECTOR or a JSON file
     detector: str = "novel"  # which one, a name or file of weights, as `novel.make_detector` takes it
-    masks: str = "true"  # whether the refiner is given the visible mask
+    masks: str = "none"  # whether the refiner is given the visible mask ("true")
     noise: tuple[float, float, float, float] = (15.0, 1.0, 1.0, 5.0)  # degrees and three cm, standard deviations;
     seed: int = 0  # of the disturbances
     preset: str = "lite"
@@ -62,6 +62,22 @@ class EvalOptions:
             raise ConfigError(
                 f"detections are {', '.join((*GIVEN, DETECTOR))} or a JSON file; there is no file {self.detections!r}."
             )
+
+    @property
+    def true_masks(self) -> bool:
+        """Whether estimates start from masks that are drawn from the annotation, which no user has."""
+        return self.masks == "true" if self.stage == "refine" else self._from_truth == "gt-masks"
+
+    @property
+    def title(self) -> str:
+        """The stage, and what it is given of the truth."""
+        if self.true_masks:
+            return f"{self.stage}, true masks"
+        return f"{self.stage} from true boxes" if self._from_truth == "gt-boxes" else self.stage
+
+    @property
+    def _from_truth(self) -> str | None:
+        return self.detections if self.stage == "estimate" and self.detections in GIVEN else None
 
     @property
     def pose_noise(self) -> PoseNoise:

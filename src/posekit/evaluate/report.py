@@ -71,7 +71,7 @@ def report(results: Mapping[str, Any], scored: Scored, data: Dataset) -> str:
             _provenance(results),
         ]
     )
-    title = escape(f"{results['dataset']['title']}, {results['stage']}")
+    title = escape(results["title"])
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>posekit eval: {title}</title>'
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
@@ -86,13 +86,14 @@ def _section(title: str, content: str) -> str:
 def _head(results: Mapping[str, Any]) -> str:
     data, counts = results["dataset"], results["counts"]
     split = f", split: {data['split_list']}, hash {data['split_hash']}" if data["split_list"] else ""
-    masks = " Visible masks rendered from the ground truth." if data["masks"].get("rendered") else ""
+    masks = f" {escape(table.TRUE_MASKS)}" if results["true_masks"] else ""
+    masks += " Visible masks rendered from the ground truth." if data["masks"].get("rendered") else ""
     shown = [m for m in ("5deg_5cm", "10deg_10cm", "add_01d", "ar", "ar_mssd_mspd") if m in results["mean"]][:4]
     big = "".join(f"<div><b>{results['mean'][m]:.1f}</b>{escape(TITLES[m])}</div>" for m in shown)
     seconds = results["seconds_per_instance"]["median"]
     big += f"<div><b>{seconds:.2f} s</b>median per instance</div>" if seconds is not None else ""
     return (
-        f"<h1>{escape(data['title'])}: {escape(results['stage'])}</h1><p class=soft>{counts['instances']} instances "
+        f"<h1>{escape(results['title'])}</h1><p class=soft>{counts['instances']} instances "
         f"({escape(data['instances'])}{escape(split)}), {counts['missing']} without an estimate.{masks} "
         f"Means over objects, percent.</p><div class=big>{big}</div>"
     )

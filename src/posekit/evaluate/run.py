@@ -258,6 +258,8 @@ def _results(
         "posekit": __version__,
         "date": time.strftime("%Y-%m-%d"),
         "stage": options.stage,
+        "title": f"{info.title}: {options.title}",
+        "true_masks": options.true_masks,
         "dataset": {
             "name": info.name,
             "title": info.title,

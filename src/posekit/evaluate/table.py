@@ -18,6 +18,7 @@ from posekit.evaluate.scoring import MEASURES, Scored
 from posekit.nets.precision import usable_cores
 
 SCHEMA = 1
+TRUE_MASKS = "True masks: drawn from the annotated poses, as no user has them; expect less without."
 AP_MEASURES = ("mssd_ap", "mspd_ap", "ap")
 # Percentages on LINEMOD with RGB alone: the paper's table, with the ADD-0.1d published for the same methods.
 PUBLISHED: dict[str, dict[str, float | None]] = {

@@ -24,6 +24,7 @@ from posekit.io.files import other_content, read_text
 from posekit.io.limits import limit
 from posekit.io.pixels import deep_colour, eight_bit, upright
 from posekit.io.pose_formats import pose_from_mapping, pose_from_text
+from posekit.results import check_schema
 from posekit.view import View
 
 log = logging.getLogger("posekit")
@@ -352,6 +353,7 @@ def load_pose(path: str | Path) -> Pose:
 
 
 def _pose_from_json(data: Any, path: Path, needed: str) -> Pose:
+    check_schema(data, str(path))
     if isinstance(data, dict) and "estimates" in data:
         if not data["estimates"]:
             raise PromptError(f"the result {path} has no estimates, so there is no pose to start from: {needed}")

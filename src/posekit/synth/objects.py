@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from posekit.datasets.symmetry import detect_symmetries
+from posekit.datasets.symmetry import DETECT, declared, load_detecting
 from posekit.errors import ConfigError, MeshError
 from posekit.mesh.model import ObjectModel
 from posekit.mesh.reading import FORMATS
@@ -25,17 +24,14 @@ def read_objects(paths: Sequence[Path], units: str, symmetry: str) -> dict[int, 
     ids = [int(n[1]) if n else 0 for n in numbers] if all(numbers) else list(range(1, len(files) + 1))
     if len(set(ids)) < len(ids):
         raise ConfigError("two of the meshes have the same number obj_NNNNNN: give each its own.")
-    renderer = Renderer() if symmetry == "detect" else None
+    renderer = Renderer() if symmetry == DETECT else None
     return {obj_id: _read(file, units, symmetry, renderer) for obj_id, file in zip(ids, files, strict=True)}
 
 
 def _read(file: Path, units: str, symmetry: str, renderer: Renderer | None) -> ObjectModel:
-    if (file.parent / "models_info.json").is_file():
-        return ObjectModel.load(file, units=units)
-    if renderer is None:
-        return ObjectModel.load(file, units=units, symmetry=symmetry)
-    model = ObjectModel.load(file, units=units)
-    return dataclasses.replace(model, symmetries=detect_symmetries(renderer, model))
+    if renderer is not None:
+        return load_detecting(file, units, renderer)
+    return ObjectModel.load(file, units=units, symmetry=None if declared(file) else symmetry)
 
 
 def _files(path: Path) -> list[Path]:
