@@ -135,7 +135,6 @@ def test_errors_know_nobody() -> None:
     assert not list(imports_of(SOURCE / "errors.py"))
 
 
-# Overrides of click's methods, and names that their class's docstring explains.
 def undocumented(scope: ast.Module | ast.ClassDef, prefix: str = "") -> Iterator[str]:
     """Public classes, methods and functions without a docstring."""
     for node in scope.body:
