@@ -168,7 +168,8 @@ class ObjectModel:
         """The largest distance of two vertices; within 0.1 % of it where the hull has thousands of corners."""
         points = self.hull_vertices
         if len(points) > 4000:
-            points = points[np.unique((points @ fibonacci_sphere(4000).T).argmax(axis=0))]
+            parts = np.array_split(fibonacci_sphere(4000), 16)  # one matrix for all would take much memory
+            points = points[np.unique(np.concatenate([(part @ points.T).argmax(axis=1) for part in parts]))]
         return float(pdist(points).max())
 
     @cached_property
