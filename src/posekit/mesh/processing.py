@@ -56,9 +56,7 @@ def _smoothed(normal: Floats, angle: Floats, ends: NDArray[np.int64]) -> Floats:
     return np.asarray(np.where(length > 1e-9, total, normal) / np.where(length > 1e-9, length, 1.0))
 
 
-def _distinct(
-    vertex: NDArray[np.int64], normal: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _distinct(vertex: NDArray[np.int64], normal: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The distinct pairs of a vertex (N,) and a normal (N, 3) in units of 1 / `_STEPS`, sorted: where each is first,
     and which of them each pair is."""
     side = 2 * _STEPS + 1
@@ -122,7 +120,7 @@ def mean_colors(
     fewer: NDArray[np.float32], vertices: NDArray[np.float32], colors: NDArray[np.uint8]
 ) -> NDArray[np.uint8]:
     """Of the vertices that each of fewer ones (V, 3) is nearest to; where there are none, of the nearest."""
-    _, owner = KDTree(fewer).query(vertices)
+    _, owner = KDTree(fewer).query(vertices, workers=-1)
     count = np.bincount(owner, minlength=len(fewer))
     sums = np.stack([np.bincount(owner, channel, minlength=len(fewer)) for channel in colors.T], axis=1)
     _, nearest = KDTree(vertices).query(fewer)
