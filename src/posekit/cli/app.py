@@ -20,6 +20,7 @@ from typer.core import TyperGroup
 
 from posekit._version import __version__
 from posekit.cli import (
+    cache,
     calibrate,
     demo,
     detect,
@@ -163,6 +164,7 @@ app.add_typer(train.train, name="train")
 app.command("eval")(eval.evaluate)
 app.command("download")(download.download)
 app.command("calibrate")(calibrate.calibrate)
+app.command("cache")(cache.cache)
 app.command("doctor")(doctor.doctor)
 app.command("demo")(demo.demo)
 

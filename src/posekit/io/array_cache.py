@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from posekit.errors import OutputError
+from posekit.io.cache_folder import make_room
 from posekit.io.files import write_bytes_atomic
 
 KEPT = 100  # files of one kind that stay on disk
@@ -41,6 +42,4 @@ def keep_arrays(
         buffer = io.BytesIO()
         (np.savez_compressed if compressed else np.savez)(buffer, **arrays)  # type: ignore[arg-type]
         write_bytes_atomic(path, buffer.getvalue())
-        files = sorted(path.parent.glob("*.npz"), key=lambda p: p.stat().st_mtime)
-        for old in files[: -(KEPT if most is None else most)]:
-            old.unlink(missing_ok=True)
+        make_room(path.parent.glob("*.npz"), KEPT if most is None else most)
