@@ -52,6 +52,7 @@ def test_add_s_is_the_same_by_both_ways(seed: int, shift: float) -> None:
     plain = metrics.adds(estimated, truth, points)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(metrics, "_MANY", 0)
+        patch.setattr(metrics, "_CELLS", 30_000)
         patch.setattr(nearest, "_RANKS", 4)
         np.testing.assert_allclose(metrics.adds(estimated, truth, points), plain, rtol=1e-12)
         one = metrics.adds(estimated[0], truth[0], points)

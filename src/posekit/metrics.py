@@ -27,8 +27,8 @@ BOP_STEPS = 315  # turns that BOP makes of a continuous symmetry: Symmetries.tra
 COCO_IOU = tuple(float(v) for v in np.linspace(0.5, 0.95, 10))
 COCO_MOST = 100  # detections per picture and class
 _ALONE = (Pose.identity(),)
-_MANY, _FEWEST = 2_000_000, 500  # queries, and points, from which nearest points are looked up in cells
-_MOST_CELLS, _QUERIES_PER_CELL = 3_000_000, 20
+_MANY, _FEWEST = 10_000_000, 500  # queries, and points, from which nearest points are looked up in cells
+_CELLS = 3_000_000  # with fewer, more points have to be compared than preparing the cells saves
 _CHUNK = 60_000  # distances that are computed at a time
 
 
@@ -285,14 +285,13 @@ def _nearest_points(cloud: Array, tree: cKDTree, between: Array) -> NearestPoint
 
     Its region holds the points of all but the two poses in a hundred that move them farthest."""
     flat = between.reshape(-1, 4, 4)
-    queries = len(cloud) * len(flat)
-    if queries < _MANY or len(cloud) < _FEWEST:
+    if len(cloud) * len(flat) < _MANY or len(cloud) < _FEWEST:
         return None
     low, high = cloud.min(axis=0), cloud.max(axis=0)
     corners = np.stack(np.meshgrid(*np.stack([low, high], axis=1), indexing="ij"), axis=-1).reshape(-1, 3)
     away = np.abs(_moved(flat, corners) - corners).max(axis=1)
     margin = np.minimum(np.quantile(away, 0.98, axis=0), 0.5 * float((high - low).max())) + 1e-3 * (high - low).max()
-    return NearestPoints(cloud, tree, low - margin, high + margin, min(_MOST_CELLS, queries // _QUERIES_PER_CELL))
+    return NearestPoints(cloud, tree, low - margin, high + margin, _CELLS)
 
 
 def _least(largest: Callable[..., Array], symmetries: Sequence[Pose], points: ArrayLike, *arrays: Array) -> Array:
