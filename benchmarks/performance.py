@@ -74,7 +74,7 @@ def milliseconds(work: Callable[[], Any], repeats: int) -> float:
 
 
 def alternating(one: Callable[[], Any], other: Callable[[], Any], repeats: int) -> tuple[float, float]:
-    """Milliseconds of two, the medians, after three runs that do not count: by turns, so that both meet the same load."""
+    """Milliseconds of two, the medians, after three runs that do not count: in turn, so that both meet one load."""
     seconds: tuple[list[float], list[float]] = ([], [])
     for _ in range(3 + repeats):
         for work, took in zip((one, other), seconds, strict=True):
