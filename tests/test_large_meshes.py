@@ -64,11 +64,21 @@ def test_the_light_copy_looks_like_the_mesh(sphere: Path, monkeypatch: pytest.Mo
     np.testing.assert_array_equal(light.light_copy(model).vertices, copy.vertices)
     camera, pose = Camera(600, 600, 79.5, 59.5, 160, 120), Pose.translation([0, 0, 0.7])
     [drawn] = Renderer().render(model, [pose], camera)
-    monkeypatch.setattr("posekit.render.renderer.SHOWN", 0)
+    monkeypatch.setattr("posekit.mesh.light.SHOWN", 0)
     [exact] = Renderer().render(model, [pose], camera)
     assert (drawn.mask != exact.mask).sum() < 0.1 * np.pi * 0.1 / 0.7 * 600  # a tenth of a pixel of the outline
     both = drawn.mask & exact.mask
     assert np.abs(drawn.image[both].astype(int) - exact.image[both]).mean() < 2
+
+
+def test_templates_are_drawn_from_a_still_lighter_copy(sphere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(light, "TEMPLATE_FACES", 1500)
+    model = ObjectModel.load(sphere)
+    assert len(light.drawn_copy(model, 64).faces) <= 1500 < len(light.drawn_copy(model, 160).faces)
+    assert light.drawn_copy(model, 64) is light.drawn_copy(model, 32)
+    assert light.drawn_copy(model, light.SHOWN + 1) is model
+    few = model.simplified(2000)
+    assert light.drawn_copy(few, 64) is few
 
 
 def test_files_of_triangles_alone_are_not_walked_through(sphere: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,10 +11,12 @@ from posekit.mesh.cache import cache_file
 from posekit.mesh.model import ObjectModel
 
 FACES = 100_000  # of a mesh that is drawn as it is
+TEMPLATE, TEMPLATE_FACES = 64, 25_000  # in pictures of up to so many pixels a side, such a mesh has so many faces
 SHOWN = 2048  # longer side, pixels, of the pictures that show the light mesh
 _VERSION = 1  # of what is kept on disk
 _NAMES = {"vertices", "faces", "normals", "colors", "uvs"}
 
+_SMALL: WeakKeyDictionary[ObjectModel, ObjectModel] = WeakKeyDictionary()
 _MADE: WeakKeyDictionary[ObjectModel, ObjectModel] = WeakKeyDictionary()
 
 
@@ -26,6 +28,18 @@ def light_copy(model: ObjectModel) -> ObjectModel:
     if model not in _MADE:
         _MADE[model] = _kept(model)
     return _MADE[model]
+
+
+def drawn_copy(model: ObjectModel, side: int) -> ObjectModel:
+    """What to draw of a model in pictures of ``side`` pixels (the longer one): the model, its light copy, or a still
+    lighter one in templates."""
+    if len(model.faces) <= FACES or side > SHOWN:
+        return model
+    if side > TEMPLATE:
+        return light_copy(model)
+    if model not in _SMALL:
+        _SMALL[model] = light_copy(model).simplified(TEMPLATE_FACES)
+    return _SMALL[model]
 
 
 def _kept(model: ObjectModel) -> ObjectModel:
