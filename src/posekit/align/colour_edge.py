@@ -144,8 +144,9 @@ def outline_lines(
 
 
 def contrast(view: View, silhouette: Mask, colours: Colours) -> float:
-    """How well a silhouette (H, W) parts the object's colours from its surroundings' in a frame's crop, -1 to 1: the mean
-    chance that a pixel is the object's in a band inside its edge, less that in a band outside; 0 where there is none."""
+    """How well a silhouette (H, W) separates the object's colours from its surroundings' in a frame's crop, -1 to 1: the
+    mean probability that a pixel is the object's in a band inside its edge, less that in a band outside; 0 where there
+    is no band."""
     solid = silhouette.astype(np.uint8)
     shown = view.shown
     inner = (

@@ -44,7 +44,9 @@ LEAST_STD = (0.5, 0.15, 0.004)  # of any pose, at least: errors last over many f
 CORRELATED = 25.0  # number of correspondences whose errors are correlated
 CLEAR = 0.3  # contrast of an outline that is evidence by itself
 MOST_GROWN = 1.5  # pixels that an outline may look larger or smaller
-BIASED, BIAS_RATE = 1.0, 0.2
+# pixels of the crop: a disagreement of the network alone that halves its weight, and the largest that counts; share of
+# a frame in what is known of it
+BIASED, MOST_BIASED, BIAS_RATE = 1.0, 2.0, 0.2
 ANGLE_OF_DOUBLE = math.radians(4.0)  # predicted angle at which that number doubles
 TINT_RATE = 0.15  # weight of a frame in the running tint
 FACES = 6000  # of the mesh that is drawn: a crop shows no more
@@ -431,7 +433,7 @@ class Tracker:
         if alone is None:
             return bias
         there, here = (camera.project(_before_camera(pose.apply(self._outline))) for pose in (alone.pose, T_view_ctr))
-        return float(np.linalg.norm(there - here, axis=1).mean())
+        return min(MOST_BIASED, float(np.linalg.norm(there - here, axis=1).mean()))
 
     def _estimate(
         self, view: View, pose: Pose, angle: float, iterations: int, score: float, timings: dict[str, float]
