@@ -144,14 +144,15 @@ def outline_lines(
 
 
 def contrast(view: View, silhouette: Mask, colours: Colours) -> float:
-    """How well a silhouette (H, W) separates the object's colours from its surroundings' in a frame's crop, -1 to 1: the
-    mean probability that a pixel is the object's in a band inside its edge, less that in a band outside; 0 where there
-    is no band."""
+    """How well a silhouette (H, W) separates the object's colours from its surroundings' in a frame's crop, -1 to 1.
+
+    The mean probability that a pixel is the object's in a band inside its edge, less that in a band outside; 0 where
+    there is no band.
+    """
     solid = silhouette.astype(np.uint8)
     shown = view.shown
-    inner = (
-        silhouette & (cv2.erode(solid, _disc(BAND + 1), borderValue=1) == 0) & (cv2.erode(solid, _disc(1)) > 0) & shown
-    )
+    deep = cv2.erode(solid, _disc(BAND + 1), borderValue=1) > 0
+    inner = (cv2.erode(solid, _disc(1)) > 0) & ~deep & shown
     outer = (cv2.dilate(solid, _disc(BAND + 1)) > cv2.dilate(solid, _disc(1))) & shown
     if not inner.any() or not outer.any():
         return 0.0

@@ -70,8 +70,8 @@ class TrackConfig:
     still_deg: float = 0.0
     converged_deg: float = 2.0  # the predicted angle below which an estimate counts as converged
     again_deg: float = 8.0
-    # by which the crops are smaller in which the outline is looked for before a frame is compared, coarse to fine; none:
-    # it is not looked for
+    # by which the crops are smaller in which the outline is looked for before a frame is compared, coarse to fine;
+    # none: it is not looked for
     scales: tuple[int, ...] = (4, 2, 1)
     margin: float = 0.02  # by which the outline's pose has to separate the colours better than the predicted one
     iterations: int = 1  # comparisons of a frame at most; a second one follows a turn of more than ``again_deg``
@@ -313,9 +313,9 @@ class Tracker:
         return GaussianPose(pose, np.asarray(np.linalg.inv(covariance))).turned(R.T)
 
     def _outlined(self, view: View, predicted: GaussianPose, last: GaussianPose, colours: Colours) -> GaussianPose:
-        """``predicted`` (``T_cam_ctr``) moved to where the frame's colours show the outline, from coarse to fine; from the
-        last motion once more, too, since quick motion leaves followed points behind. Of these poses and the predicted
-        one that is taken whose silhouette separates the colours best."""
+        """``predicted`` (``T_cam_ctr``) moved to where the frame's colours show the outline, from coarse to fine. The
+        last motion once more is another start, since quick motion leaves followed points behind. Of these poses and
+        the predicted one that is taken whose silhouette separates the colours best."""
         if not self.config.scales or not self.config.outline:
             return predicted
         starts = [predicted.pose]
@@ -419,13 +419,13 @@ class Tracker:
         points = keyframe.drawn.coords[found.source[:, 1], found.source[:, 0]] - self.model.center
         if not len(points):
             return []
-        correlated = CORRELATED * (1 + (prediction.angle / ANGLE_OF_DOUBLE) ** 2) * (1 + (self._bias / BIASED) ** 2)
+        doubt = (1 + (prediction.angle / ANGLE_OF_DOUBLE) ** 2) * (1 + (self._bias / BIASED) ** 2)
         scale = np.maximum(found.scale_px, LEAST_SCALE)
-        return [Points(points.astype(np.float64), found.target, found.weight, scale, KNEE, correlated)]
+        return [Points(points.astype(np.float64), found.target, found.weight, scale, KNEE, CORRELATED * doubt)]
 
     def _disagreement(self, keyframe: Keyframe, prediction: PairPrediction, T_view_ctr: Pose) -> float:
-        """How far, in pixels of the crop, the object's points lie in the pose that the network alone gives from where they
-        lie in the ``T_view_ctr`` that all evidence gave; the mean over the convex hull's corners."""
+        """How far, in pixels of the crop, the object's points lie in the pose that the network alone gives from where
+        they lie in the ``T_view_ctr`` that all evidence gave; the mean over the convex hull's corners."""
         camera, bias, self._bias = keyframe.drawn.camera, self._bias, 0.0
         network = self._network(keyframe, prediction)
         self._bias = bias
