@@ -230,7 +230,7 @@ class Tracker:
 
     def _growth(self, view: View, pose: Pose, scale: int) -> float:
         """By how many pixels of a crop that is smaller by ``scale`` the outline that the colours show lies outside that
-        of a first pose, in the mean: soft edges and blur make an object look larger or smaller than it is drawn."""
+        of a first pose, in the median: soft edges and blur make an object look larger or smaller than it is drawn."""
         assert self._colours is not None
         width, height = self.predictor.size
         size = (width // scale, height // scale)
@@ -471,8 +471,10 @@ class Tracker:
         return share == 0 or self._doubts >= self.config.doubts
 
     def _outline_holds(self) -> bool:
-        """Whether the last frame's silhouette separates the colours at least half as well as the first one's did, so that
-        the predicted angle alone is no reason for doubt: on a mesh without colours, or a shining one, it says little."""
+        """Whether the last frame's silhouette separates the colours at least half as well as the first one's did.
+
+        Then the predicted angle alone is no reason for doubt: on a mesh without colours, or a shining one, it says
+        little."""
         return self._separated_first > CLEAR and self._separated > 0.5 * self._separated_first
 
     def _reset(self) -> None:
