@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -101,3 +103,12 @@ def test_an_estimate_needs_no_torch(kept: Path) -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False,
                           env={**os.environ, "XDG_CACHE_HOME": str(kept)})  # fmt: skip
     assert done.returncode == 0, done.stderr
+
+
+def test_a_predictor_is_freed(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(kept))
+    predictor = Runtime(runtime="openvino").predictor
+    left = weakref.ref(predictor)
+    del predictor
+    gc.collect()
+    assert left() is None

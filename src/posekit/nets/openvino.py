@@ -63,8 +63,13 @@ class OpenVinoPredictor:
         compiled = openvino.Core().compile_model(_converted(svnet, digest), "CPU", options)
         make_room(user_cache("openvino/compiled").glob("*.blob"), KEPT_BLOBS)
         self._queue = openvino.AsyncInferQueue(compiled, streams)
-        self._queue.set_callback(self._done)
-        self._answers: dict[int, list[Any]] = {}
+        answers: dict[int, list[Any]] = {}
+
+        def done(request: Any, k: int) -> None:  # no method: the queue would hold this object, and never be freed
+            answers[k] = [np.array(output.data) for output in request.output_tensors]
+
+        self._queue.set_callback(done)
+        self._answers = answers
 
     def predict(self, observed: Sequence[View], rendered: Sequence[View]) -> list[PairPrediction]:
         """As `Predictor.predict`."""
@@ -74,9 +79,6 @@ class OpenVinoPredictor:
             self._queue.start_async([first, second, relief(r)[None], focal], k)
         self._queue.wait_all()
         return [unpack(self._answers.pop(k), 0, drawn) for k, drawn in enumerate(rendered)]
-
-    def _done(self, request: Any, k: int) -> None:
-        self._answers[k] = [np.array(output.data) for output in request.output_tensors]
 
 
 def has_bfloat16() -> bool:
