@@ -137,7 +137,8 @@ def estimate(
     with destination.working("loading the networks"):
         estimators = Estimators(preset=preset, weights=weights, options=options, device=device)
     search = SearchOptions.usual(found)
-    search = replace(search, instances=search.instances if asked else instances,
+    search = replace(search, candidates=max(search.candidates, instances + 1),
+                     instances=search.instances if asked else instances,
                      min_score=search.min_score if min_score is None else min_score)  # fmt: skip
     with destination.working("estimating"):
         results = find_instances(estimators, view, meshes, found, search)

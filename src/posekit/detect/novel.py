@@ -42,6 +42,7 @@ ANY = "novel"  # the name of the shipped detector
 SIDE = 96  # pixels of the pictures whose features are compared
 LEVELS = {"2": 16, "3": 32}  # of the features, and their strides
 MARGIN = 1.1
+SCREENED, LEAST_SIMILARITY = 24, 0.05  # detections of a mesh that poses choose among, and the least similarity of one
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,7 @@ class NovelOptions:
     chroma: float = 60.0  # difference of the median a and b (CIELAB, 8 bits) at which a score falls to 1/e
     objectness: float = 0.2  # power of the proposal's own score
     views: int = 66  # pictures of a mesh whose features are kept
+    sharpen: bool = True  # fit the masks to the colours of the photograph, see `sharpened`
     overlap: float = 0.5  # intersection over union of masks from which two detections are of one instance
 
     def __post_init__(self) -> None:
@@ -177,7 +179,7 @@ class NovelDetector:
         appearance = self.similarity.appearance(view, proposals)
         found = [each for model in models for each in self._instances(view, model, proposals, appearance)]
         new = [each for each in found if not any(_same_instance(each, other, self.options.overlap) for other in known)]
-        return known + [sharpened(view.image, each) for each in new]
+        return known + ([sharpened(view.image, each) for each in new] if self.options.sharpen else new)
 
     def _by_features(self, view: View, model: ObjectModel) -> list[Detection]:
         """Boxes of the instances that local features find; half of the score is reached by the least inliers."""
@@ -295,7 +297,8 @@ def make_detector(
     doubtful: bool = False,
 ) -> tuple[Detector, tuple[str, ...]]:
     """A network's Detector and the names that its detections may have. name: "novel" (the default), "coco", or a
-    trained detector's file or folder. max_detections: of a mesh. doubtful: whether the detections are verified by
+    trained detector's file or folder. max_detections: of a mesh (of the novel detector only where poses do not verify
+    them: then it gives `SCREENED`). doubtful: whether the detections are verified by
     poses, so that trained detectors' doubtful ones are wanted too, and no more than ``max_detections``. Raises
     WeightsError, ConfigError.
     """
@@ -316,6 +319,8 @@ def make_detector(
         if min_score is None
         else NovelOptions(min_score=min_score, min_proposal_score=min_score, max_detections=max_detections)
     )
-    if models and min_score is not None:
+    if doubtful and models and min_score is None:  # poses choose among many
+        options = NovelOptions(max_detections=SCREENED, min_score=LEAST_SIMILARITY, sharpen=False)
+    elif models and min_score is not None:
         options = NovelOptions(min_score=min_score, max_detections=max_detections)
     return NovelDetector(trained, Renderer(), options), tuple(m.name for m in models) or trained.config.classes

@@ -27,7 +27,7 @@ from posekit.first_pose.hypotheses import (
 )
 from posekit.geometry import Pose, rotation_angle
 from posekit.mesh.model import ObjectModel
-from posekit.nets.predictor import Predictor
+from posekit.nets.predictor import PairPrediction, Predictor
 from posekit.nets.runtime import Runtime
 from posekit.render import Renderer
 from posekit.results import Branch, Detection, Estimate
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from posekit.nets.weights import Networks
 log = logging.getLogger("posekit")
 
+SCREENED_POSES, SCREENED_EVIDENCE = 2, 2.0  # first poses of a detection that is screened; weight of their evidence
 INITS = ("templates", "mvnet")
 AUTO = "auto"  # correspondences where the network gives them, else the regressed delta
 STRUCTURE, BLUR, ANGLE, BIAS = 5.7, -1.6, -1.6, 1.2  # of `existence_score`, fitted: docs/decisions/0020
@@ -106,12 +107,16 @@ class PoseEstimator:
         self.runtime = networks
         self.refine_options = options.refine_options(networks.dense)
         self.renderer = Renderer()
-        self._search: BoxSearch | FirstPoseSearch | None = None
+        self._search: FirstPoseSearch | None = None  # in place of the search by boxes
         self._features = FeatureSearch(model, self.renderer)
         if options.init == "mvnet":
             from posekit.first_pose.mvnet import mvnet_search
 
             self._search = mvnet_search(model, self.networks, self.renderer)
+
+    @cached_property
+    def _box_search(self) -> BoxSearch:
+        return BoxSearch(self.model, self.renderer)
 
     @cached_property
     def predictor(self) -> Predictor:
@@ -149,6 +154,29 @@ class PoseEstimator:
             timings = {"first_pose": searched - started, "refine": done - searched, "total": done - started}
             estimates.append(self._choose(masked, scorer, refined, detection, timings))
         return estimates
+
+    def screen(self, view: View, detections: Sequence[Detection]) -> list[float]:
+        """How much each detection's first poses, updated once, speak for the object: log odds of `existence_score` and
+        the evidence of the search, the best of `SCREENED_POSES`; -inf where there is no first pose. Much quicker than
+        `estimate`."""
+        found = [
+            (k, hypothesis)
+            for k, detection in enumerate(detections)
+            for hypothesis in self._box_search.search(view, replace(detection, mask=None), SCREENED_POSES, moved=False)
+        ]
+        scores = np.full(len(detections), -np.inf)
+        if not found:
+            return scores.tolist()
+        poses = [hypothesis.T_cam_obj for _, hypothesis in found]
+        hull, update = self.model.hull_ctr, self.refine_options.update
+        compared = zip(poses, *compare(view, self.model, hull, poses, self.predictor, self.renderer), strict=True)
+        updated = [update_pose(T, self.model, p, o, d, update) or T for T, p, o, d in compared]
+        looks = zip(*compare(view, self.model, hull, updated, self.predictor, self.renderer), strict=True)
+        for (k, hypothesis), (prediction, observed, rendered) in zip(found, looks, strict=True):
+            exists = _existence(prediction, observed, rendered, prediction.angle)
+            odds = np.log(max(exists, 1e-6) / max(1 - exists, 1e-6)) + SCREENED_EVIDENCE * hypothesis.score
+            scores[k] = max(scores[k], odds)
+        return scores.tolist()
 
     def refine(self, view: View, T_cam_obj: Pose) -> Estimate:
         """Refine a known pose; view.mask, where there is one, helps. Where it does not converge within a few
@@ -213,13 +241,12 @@ class PoseEstimator:
     def first_poses(self, view: View, detection: Detection) -> list[Hypothesis]:
         """The first poses that ``options.init`` gives, best first; those for a detection's rough mask come last. Those
         that the mesh's texture gives come before ``templates``'s."""
-        if self._search is None:
-            self._search = BoxSearch(self.model, self.renderer)
+        search = self._search or self._box_search
         found: list[Hypothesis] = []
         for mask in (detection.mask, detection.rough):
             if mask is not None or not found:
                 box = detection.box if mask is None or detection.rough is None else mask_box(mask) or detection.box
-                found += self._search.search(view, replace(detection, box=box, mask=mask), self.options.hypotheses)
+                found += search.search(view, replace(detection, box=box, mask=mask), self.options.hypotheses)
         if self.options.init != "templates":
             return found
         textured = self._features.search(view, detection.box)
@@ -283,13 +310,11 @@ class PoseEstimator:
         [prediction], [observed], [rendered] = compare(
             view, self.model, outline, [T_cam_obj], self.predictor, self.renderer
         )
-        found = prediction.correspondences
-        error = float(np.median(found.scale_px)) if found is not None and len(found.scale_px) else DEFAULT_SCALE_PX
         update = self.refine_options.update
         outlined = self.refine_options.colour_edge
         updated = update_pose(T_cam_obj, self.model, prediction, observed, rendered, update, outlined)
         angle = predicted_angle(T_cam_obj, prediction, updated, update)
-        return existence_score(agreement_of(observed, rendered).structure, error, angle), angle
+        return _existence(prediction, observed, rendered, angle), angle
 
     def _scores(self, scorer: EvidenceScorer, refined: Sequence[Refinement]) -> list[float]:
         evidence = scorer.scores([r.T_cam_obj for r in refined])
@@ -334,6 +359,13 @@ def nearest_to(reference: Pose, estimate: Estimate, model: ObjectModel, branch: 
     if not model.symmetries:
         return estimate
     return replace(estimate, T_cam_obj=model.symmetries.nearest(estimate.T_cam_obj, reference), branch=branch)
+
+
+def _existence(prediction: PairPrediction, observed: View, rendered: View, angle: float) -> float:
+    """`existence_score` of a pose that was compared."""
+    found = prediction.correspondences
+    error = float(np.median(found.scale_px)) if found is not None and len(found.scale_px) else DEFAULT_SCALE_PX
+    return existence_score(agreement_of(observed, rendered).structure, error, angle)
 
 
 def hypothesis_score(angle: float, evidence: float) -> float:

@@ -10,7 +10,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+import numpy as np
+
 from posekit.camera import box_iou
+from posekit.detect.sharpen import sharpened
 from posekit.detect.similarity import USUAL, WEIGHT, shifted
 from posekit.errors import ConfigError
 from posekit.mesh.model import ObjectModel
@@ -20,6 +23,10 @@ from posekit.view import View
 
 class Estimator(Protocol):
     """What a `PoseEstimator` does for the search."""
+
+    def screen(self, view: View, detections: Sequence[Detection]) -> list[float]:
+        """How much a quick look at each detection speaks for the object, as log odds."""
+        ...
 
     def estimate(self, view: View, detections: Sequence[Detection], min_score: float = 0.0) -> list[Estimate]:
         """Estimates of its model at the detections, by falling score, those of at least ``min_score``."""
@@ -35,10 +42,13 @@ class SearchOptions:
     instances: int = 1  # kept at most; 0 = all
     min_score: float = 0.5  # score of an estimate below which it is no instance
     overlap: float = 0.5  # of the boxes (intersection over union) from which two estimates are of one instance
+    candidates: int = 3  # the novel detector's detections that are estimated, the most promising ones
 
     def __post_init__(self) -> None:
-        if self.instances < 0 or not 0 <= self.min_score <= 1 or not 0 < self.overlap <= 1:
-            raise ConfigError("instances is not negative, min_score in [0, 1] and overlap in (0, 1].")
+        if self.instances < 0 or self.candidates < 1 or not 0 <= self.min_score <= 1 or not 0 < self.overlap <= 1:
+            raise ConfigError(
+                "instances is not negative, candidates at least 1, min_score in [0, 1] and overlap in (0, 1]."
+            )
 
     @classmethod
     def usual(cls, detections: Sequence[Detection]) -> SearchOptions:
@@ -78,9 +88,24 @@ def find_instances(
     found = []
     for model in models:
         mine = [detection for detection in detections if detection.label in (None, model.name)]
+        mine = promising(estimator_of, model, view, mine, options.candidates)
         estimates = estimates_of(estimator_of(model), view, mine, options) if mine else []
         found.append(Found(model, mine, estimates, instances_of(estimates, options)))
     return found
+
+
+def promising(
+    estimator_of: EstimatorOf, model: ObjectModel, view: View, detections: Sequence[Detection], count: int
+) -> list[Detection]:
+    """The detections, but of the novel detector's only the ``count`` that similarity and a quick look at a pose speak
+    for most, last and with masks fitted to the photograph's colours."""
+    novel = [each for each in detections if each.source is Source.NOVEL]
+    if len(novel) > count:
+        quick = estimator_of(model).screen(view, novel)
+        odds = [WEIGHT * (each.score - USUAL) + look for each, look in zip(novel, quick, strict=True)]
+        novel = [novel[k] for k in np.argsort(np.negative(odds), kind="stable")[:count]]
+    others = [each for each in detections if each.source is not Source.NOVEL]
+    return others + [each if each.rough is not None else sharpened(view.image, each) for each in novel]
 
 
 def estimates_of(

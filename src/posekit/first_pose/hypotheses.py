@@ -291,10 +291,11 @@ class BoxSearch:
         self.silhouettes = Silhouettes.joined(quarters)
         self.aspects = np.array([placed.aspect for placed in self.placed])
 
-    def search(self, view: View, detection: Detection, count: int) -> list[Hypothesis]:
+    def search(self, view: View, detection: Detection, count: int, *, moved: bool = True) -> list[Hypothesis]:
         """The best ``count`` first poses for a detection, best first, none nearer to another than ``apart``.
 
         view: the photograph. detection: its box; where it has a mask, its overlap with the silhouette counts too.
+        moved: whether the best silhouettes are moved, scaled and turned a little, which takes three times as long.
         """
         zoom = box_window(view.camera, detection.box, FINER * self.options.side, self.options.root / self.options.side)
         masked = view.with_mask(detection.mask)
@@ -310,7 +311,10 @@ class BoxSearch:
         found = self.silhouettes.chosen(rows)
         scores = found.scores(self._picture(crop, shown, palette, _Move()), self.weights)
         best = rows[np.argsort(-scores, kind="stable")[: self.options.tried]]
-        moves, scores = self._moved(crop, shown, palette, best)
+        if moved:
+            moves, scores = self._moved(crop, shown, palette, best)
+        else:
+            moves, scores = [_Move()] * len(best), np.sort(scores)[::-1][: len(best)]
         return self._apart(crop, best, moves, scores, count)
 
     def _apart(
