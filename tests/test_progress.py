@@ -16,8 +16,9 @@ def test_nothing_is_shown_where_there_is_no_terminal(capsys: pytest.CaptureFixtu
 
 
 def test_a_terminal_shows_text_and_counts_on_standard_error(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
+    caplog.set_level("INFO", "posekit")  # as the commands have it without --quiet
     monkeypatch.setattr(rich.console.Console, "is_terminal", True)
     with progress_bar("count", "text") as update:
         update(completed=2, total=7, description="frames")

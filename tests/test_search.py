@@ -19,7 +19,7 @@ from posekit.cli.app import app
 from posekit.datasets.bop import BopDataset
 from posekit.detect.segmentation import encode, xywh
 from posekit.estimate.estimator import EstimateOptions, Estimators
-from posekit.estimate.instances import SearchOptions, estimates_of, find_instances, scored_by_poses
+from posekit.estimate.instances import SearchOptions, estimates_of, find_instances, promising, scored_by_poses
 from posekit.evaluate import EvalOptions
 from posekit.evaluate.stages import ImageStage
 from posekit.evaluate.truths import Truth, TruthReader
@@ -143,6 +143,10 @@ class Fixed:
 
     def __init__(self, scores: Sequence[float], boxes: Sequence[tuple[float, float, float, float]] = BOXES) -> None:
         self.scores, self.asked = dict(zip(boxes, scores, strict=False)), []  # type: ignore[var-annotated]
+        self.quick: dict[tuple[float, float, float, float], float] = {}
+
+    def screen(self, view: View, detections: Sequence[Detection]) -> list[float]:
+        return [self.quick.get(d.box, 0.0) for d in detections]
 
     def estimate(self, view: View, detections: Sequence[Detection], min_score: float = 0.0) -> list[Estimate]:
         self.asked.append(min_score)
@@ -234,3 +238,16 @@ def test_the_tracker_asks_what_the_others_ask(score: float, state: str) -> None:
     image = np.full((120, 160, 3), 128, np.uint8)
     tracker = Tracker(MODEL, CAMERA, estimator=estimator, detector=Detector(), predictor=Oracle(MODEL, place))  # type: ignore[arg-type]
     assert tracker.step(image).state == state
+
+
+def test_the_most_promising_of_many_proposals_are_estimated() -> None:
+    """Similarity and a quick look count; detections of others keep their places."""
+    boxes = [(10.0 * k, 0.0, 10.0 * k + 8.0, 8.0) for k in range(6)]
+    fixed, model = Fixed([0.9] * 6, boxes), bracket()
+    fixed.quick = {boxes[4]: 5.0, boxes[1]: -50.0}
+    novel = [Detection(box, None, 0.9 - 0.01 * k, model.name, Source.NOVEL) for k, box in enumerate(boxes)]
+    given = Detection((90.0, 0.0, 98.0, 8.0), None, 0.1, model.name, Source.FEATURES)
+    view = View(np.zeros((100, 100, 3), np.uint8), Camera(100.0, 100.0, 50.0, 50.0, 100, 100))
+    chosen = promising(lambda _: fixed, model, view, [given, *novel], 3)
+    assert [d.box for d in chosen] == [given.box, boxes[4], boxes[0], boxes[2]]
+    assert promising(lambda _: fixed, model, view, novel[:3], 3) == novel[:3], "few are not screened"
