@@ -58,7 +58,7 @@ def test_lines_are_few() -> None:
     now = 0.0
     lines = PlainLines(lambda: now)
     told = []
-    for step in range(0, 400):
+    for step in range(400):
         now = step / 10
         lines.update("detecting" if now < 1 else "refining", f"{now:.0f} of 40")
         if (line := lines.due()) is not None:

@@ -316,7 +316,10 @@ ConfigFileOption = Annotated[
     Path | None,
     typer.Option("--config", metavar="TOML", help="File with all settings; options given here override it."),
 ]
-MinutesOption = Annotated[float | None, typer.Option(help="Stop after so many minutes.", rich_help_panel=SCHEDULE)]
+MinutesOption = Annotated[
+    float | None,
+    typer.Option(help="End after so many minutes, with the last validation and export.", rich_help_panel=SCHEDULE),
+]
 StepsOption = Annotated[int | None, typer.Option(help="Stop after so many optimiser steps.", rich_help_panel=SCHEDULE)]
 RateOption = Annotated[float | None, typer.Option(help="Highest learning rate.", rich_help_panel=SCHEDULE)]
 TrainingSeedOption = Annotated[
