@@ -318,7 +318,7 @@ ConfigFileOption = Annotated[
 ]
 MinutesOption = Annotated[
     float | None,
-    typer.Option(help="End after so many minutes, with the last validation and export.", rich_help_panel=SCHEDULE),
+    typer.Option(help="End within so many minutes, the last validation and export included.", rich_help_panel=SCHEDULE),
 ]
 StepsOption = Annotated[int | None, typer.Option(help="Stop after so many optimiser steps.", rich_help_panel=SCHEDULE)]
 RateOption = Annotated[float | None, typer.Option(help="Highest learning rate.", rich_help_panel=SCHEDULE)]
