@@ -21,7 +21,7 @@ NOT_RELIABLE = 3  # exit code of --require-reliable
 ImagesArgument = Annotated[
     list[Path],
     typer.Argument(
-        metavar="IMAGE...",
+        metavar="IMAGE",
         help="The photograph, or several: files, a folder of pictures or a glob.",
         show_default=False,
     ),
