@@ -12,7 +12,7 @@ from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).resolve().parent.parent
 OUTSIDE = {"index.md": "README.md"} | {f"{n.lower()}.md": f"{n}.md" for n in ("CHANGELOG", "CONTRIBUTING", "SECURITY")}
-MADE = {*OUTSIDE, "examples.md", "command-line.md"}
+MADE = {*OUTSIDE, "examples.md", "commands.md"}
 COMMAND_LINE = [sys.executable, "-m", "typer", "posekit.cli.app", "utils", "docs", "--name", "posekit"]
 
 
@@ -40,7 +40,7 @@ def on_files(files: Files, config: Any) -> Files:
     pages = {
         **{page: (ROOT / name).read_text(encoding="utf-8") for page, name in OUTSIDE.items()},
         "examples.md": "# Examples\nShort programs of `examples/`; the tests run them.\n" + "".join(programs),
-        "command-line.md": re.sub(r"^\*\*Commands\*\*:\n\n(\* .*\n)+", "", command_line, flags=re.MULTILINE),
+        "commands.md": re.sub(r"^\*\*Commands\*\*:\n\n(\* .*\n)+", "", command_line, flags=re.MULTILINE),
     }
     for name, text in pages.items():
         files.append(File.generated(config, name, content=text))

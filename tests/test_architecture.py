@@ -15,7 +15,7 @@ SOURCE = Path(__file__).resolve().parent.parent / "src" / "posekit"
 # Rooms that are planned stand here too; a room that is built must stand here.
 LAYERS = {
     0: {"geometry", "camera", "lens"},
-    1: {"view", "results", "machines"},
+    1: {"view", "results", "machines", "nearest"},
     2: {"io", "metrics"},
     3: {"mesh"},
     4: {"zoom", "render", "nets", "object_model"},

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from posekit.align import colour_edge as edge
-from posekit.align.colour_edge import Colours, Tint, find_outline, learn, outline_lines
+from posekit.align.colour_edge import Colours, Tint, contrast, find_outline, learn, outline_lines
 from posekit.camera import Camera
 from posekit.view import View
 
@@ -309,3 +309,14 @@ def test_lines_whose_step_is_at_the_ends_of_their_reach_are_left_out() -> None:
     colours = learn(view, disc(30), disc(30))
     assert outline_lines(view, drawn(34), colours, whole, np.zeros(3)) is not None  # 4 pixels off
     assert outline_lines(view, drawn(35.4), colours, whole, np.zeros(3)) is None  # 5.4 pixels off, of a reach of 6
+
+
+def test_contrast_is_largest_at_the_right_silhouette() -> None:
+    view = View(painted(30.0), CAMERA)
+    colours = learn(view, disc(30.0), np.ones((HEIGHT, WIDTH), bool))
+    right = contrast(view, disc(30.0), colours)
+    assert right > 0.9
+    for wrong in (disc(24.0), disc(36.0), disc(30.0, CENTRE + 5)):
+        assert contrast(view, wrong, colours) < right - 0.2
+    assert contrast(view, np.zeros((HEIGHT, WIDTH), bool), colours) == 0
+    assert abs(contrast(View(one_colour(RED), CAMERA), disc(30.0), colours)) < 0.05

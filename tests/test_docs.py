@@ -10,8 +10,10 @@ import logging
 import re
 import shlex
 import shutil
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 from typing import Any, NamedTuple
 
 import click
@@ -86,7 +88,8 @@ def folder(example: Example, tmp_path_factory: pytest.TempPathFactory) -> Path:
     [drawn] = renderer.render(example.model, [example.T_cam_obj], example.view.camera)
     assert drawn.mask is not None
     cv2.imwrite(str(folder / "mask.png"), drawn.mask.astype("uint8") * 255)
-    (folder / "part.ply").write_text(ply(example.model))
+    for name in ("part.ply", "mug.ply"):
+        (folder / name).write_text(ply(example.model))
     np.savetxt(folder / "pose.txt", next(make_film(renderer, 1)).T_cam_obj.matrix)
     trimesh.Trimesh(example.model.vertices, example.model.faces).export(folder / "part.glb")
     vertices = "".join("v {:.6f} {:.6f} {:.6f}\n".format(*vertex) for vertex in example.model.vertices)
@@ -109,7 +112,15 @@ def test_python_blocks_run(
         "camera": example.view.camera,
         "first_pose": example.T_cam_obj,
         "T_cam_obj": example.T_cam_obj,
+        "network": lambda file: [file],
     }
+    # what another detector would give, in the shape of supervision's detections
+    found = SimpleNamespace(
+        xyxy=np.array([example.box]), confidence=np.array([0.9]), mask=None, class_id=None, data={"class_name": ["mug"]}
+    )
+    stand_in: Any = ModuleType("supervision")
+    stand_in.Detections = SimpleNamespace(from_ultralytics=lambda result: found)
+    monkeypatch.setitem(sys.modules, "supervision", stand_in)
     for block in BLOCKS:
         if block.page == page and block.language == "python":
             exec(compile(block.code, page, "exec"), names)
@@ -135,7 +146,7 @@ def test_commands_run(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_commands_have_the_options_that_are_shown(command: str) -> None:
     words = shlex.split(command, comments=True)[1:]
     group: Any = get_command(app)
-    while hasattr(group, "commands"):
+    while hasattr(group, "commands") and not words[0].startswith("-"):
         assert words[0] in group.commands, f"there is no command {words[0]!r} in: {command}"
         group, words = group.commands[words[0]], words[1:]
     known = {name for parameter in group.params for name in (*parameter.opts, *parameter.secondary_opts)}
@@ -150,6 +161,8 @@ def test_options_named_in_texts_exist() -> None:
             yield from options(each)
 
     known = {*options(get_command(app)), "--help"}
+    for file in (ROOT / "benchmarks").glob("*.py"):
+        known |= set(re.findall(r'"(--[a-z][a-z-]*)"', file.read_text()))
     for page in PAGES:
         if page.name in ("log.md", "results.md", "releasing.md"):
             continue
@@ -183,7 +196,7 @@ def test_site_is_built_without_a_warning(tmp_path: Path, monkeypatch: pytest.Mon
     for page in pages:
         loaded = re.findall(r"<(?:script|img|link)[^>]*(?:src|href)=\"?(https?:[^\s\">]+)", page.read_text())
         assert not loaded, f"{page.name} loads {loaded}"
-    assert "posekit estimate" in (tmp_path / "site/command-line.html").read_text()
+    assert "posekit estimate" in (tmp_path / "site/commands.html").read_text()
     assert "PoseEstimator" in (tmp_path / "site/python.html").read_text()
 
 

@@ -11,9 +11,11 @@ import pytest
 
 from objects import CAMERA, bracket, cuboid
 from posekit.detect.novel import make_detector
-from posekit.first_pose import features, mesh_cache
+from posekit.first_pose import features
 from posekit.first_pose.features import VERSION, FeatureModel, FeatureSearch
 from posekit.geometry import Pose, random_rotation, rotation_angle
+from posekit.io import array_cache
+from posekit.mesh import cache as mesh_cache
 from posekit.mesh.model import ObjectModel
 from posekit.render import Light, Renderer
 from posekit.view import View
@@ -165,7 +167,7 @@ def test_another_texture_has_another_file_and_a_damaged_one_is_made_anew(
 
 def test_the_oldest_files_make_room(renderer: Renderer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(mesh_cache, "KEPT", 2)
+    monkeypatch.setattr(array_cache, "KEPT", 2)
     for seed in range(3):
         FeatureModel.of(textured(seed), renderer)
     left = set(mesh_cache.cache_file("features", textured(), VERSION).parent.glob("*.npz"))

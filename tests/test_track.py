@@ -276,7 +276,7 @@ def test_a_small_predicted_angle_leaves_the_pose_where_asked(model: ObjectModel,
 
 def test_a_large_turn_is_compared_again(model: ObjectModel, renderer: Renderer) -> None:
     for iterations, calls in ((1, 1), (3, 2)):
-        config = TrackConfig(motion="none", outline=False, texture=False, iterations=iterations, again_deg=2.0)
+        config = TrackConfig(motion="none", outline=False, texture=False, iterations=iterations, again_deg=0.5)
         following = tracker(model, renderer, path(model, 6), config, pose=path(model, 0))
         following.step(photograph(renderer, model, path(model, 0)).image)
         before = following.predictor.calls  # type: ignore[attr-defined]
@@ -284,7 +284,12 @@ def test_a_large_turn_is_compared_again(model: ObjectModel, renderer: Renderer) 
         assert following.predictor.calls - before == calls  # type: ignore[attr-defined]
 
 
-def test_a_large_predicted_angle_restarts(model: ObjectModel, renderer: Renderer) -> None:
+@pytest.mark.parametrize("clear", [True, False])
+def test_a_large_predicted_angle_restarts_where_the_outline_is_no_evidence(
+    clear: bool, model: ObjectModel, renderer: Renderer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not clear:
+        monkeypatch.setattr("posekit.tracking.tracker.contrast", lambda *_: 0.1)
     truth, finder = path(model, 0), Finder()
     following = tracker(
         model, renderer, truth, pose=truth, estimator=Estimator(model, renderer, truth), detector=finder
@@ -294,9 +299,30 @@ def test_a_large_predicted_angle_restarts(model: ObjectModel, renderer: Renderer
     states = [following.step(image).state for _ in range(3)]
     assert states == [TRACKED] * 3, "the first pose is given; one frame in doubt is no loss"
     found = following.step(image)
+    if clear:
+        assert found.state == TRACKED and finder.calls == 0
+        return
     assert found.state == RESTARTED and finder.calls == 1
     following.predictor.angles = [0.01]  # type: ignore[attr-defined]
     assert following.step(photograph(renderer, model, truth).image).state == TRACKED
+
+
+def test_quick_motion_is_followed_by_the_outline_alone(model: ObjectModel, renderer: Renderer) -> None:
+    """A mesh without colours, a network that says nothing, 19 pixels and 4 degrees a frame."""
+    plain = replace(model, colors=None, uvs=None, texture=None)
+    start = path(model, 0)
+
+    def place(k: int) -> Pose:
+        return Pose(so3_exp([0.0, 0.07 * k, 0.0]) @ start.R, start.t + [0.02 * k, 0.0, 0.0])
+
+    ends = {}
+    for scales in ((4, 2, 1), ()):
+        config = TrackConfig(scales=scales, motion="none", still_deg=24.9)
+        following = tracker(plain, renderer, start, config, pose=start)
+        for k in range(5):
+            found = following.step(photograph(renderer, model, place(k)).image)
+        ends[scales] = pose_error([found.T_cam_obj], [place(4)])[1][0] if found.T_cam_obj is not None else np.inf
+    assert ends[4, 2, 1] < 0.01 < ends[()]
 
 
 def test_what_disappears_is_lost_soon_and_found_again(model: ObjectModel, renderer: Renderer) -> None:

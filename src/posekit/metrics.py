@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from posekit.camera import Camera
 from posekit.geometry import Pose, fibonacci_sphere, rotation_angle
+from posekit.nearest import NearestPoints
 
 Array = NDArray[np.float64]
 Depth = NDArray[np.floating]
@@ -23,6 +24,8 @@ Cameras = Camera | ArrayLike  # one for all poses, or matrices (3, 3) or (N, 3, 
 
 BOP_STEPS = 315  # turns that BOP makes of a continuous symmetry: Symmetries.transforms(BOP_STEPS)
 _ALONE = (Pose.identity(),)
+_MANY, _FEWEST = 10_000_000, 500  # queries, and points, from which nearest points are looked up in cells
+_CELLS = 3_000_000  # with fewer, more points have to be compared than preparing the cells saves
 _CHUNK = 60_000  # distances that are computed at a time
 
 
@@ -78,7 +81,12 @@ def adds(estimated: Poses, truth: Poses, points: ArrayLike) -> Array:
     est, gt = np.broadcast_arrays(_matrices(estimated), _matrices(truth))
     between = _inverse(est) @ gt
     share = count / count.sum()
-    return _by_chunk(lambda T: tree.query(_moved(T, cloud), workers=-1)[0] @ share, len(cloud), between)
+    found = _nearest_points(cloud, tree, between)
+    if found is None:
+        return _by_chunk(lambda T: tree.query(_moved(T, cloud), workers=-1)[0] @ share, len(cloud), between)
+    columns = np.ascontiguousarray(cloud.T)
+    means = [found.distances(T[:3, :3] @ columns + T[:3, 3:]) @ share for T in between.reshape(-1, 4, 4)]
+    return np.reshape(means, between.shape[:-2])[()]
 
 
 def auc(errors: ArrayLike, limit: float = 0.1) -> Array:
@@ -198,6 +206,20 @@ def _inverse(T: Array) -> Array:
     out[..., :3, 3] = -np.einsum("...ij,...j->...i", out[..., :3, :3], T[..., :3, 3])
     out[..., 3, 3] = 1.0
     return out
+
+
+def _nearest_points(cloud: Array, tree: cKDTree, between: Array) -> NearestPoints | None:
+    """For the points as transforms (..., 4, 4) move them; None where there are too few queries for its preparation.
+
+    Its region holds the points of all but the two poses in a hundred that move them farthest."""
+    flat = between.reshape(-1, 4, 4)
+    if len(cloud) * len(flat) < _MANY or len(cloud) < _FEWEST:
+        return None
+    low, high = cloud.min(axis=0), cloud.max(axis=0)
+    corners = np.stack(np.meshgrid(*np.stack([low, high], axis=1), indexing="ij"), axis=-1).reshape(-1, 3)
+    away = np.abs(_moved(flat, corners) - corners).max(axis=1)
+    margin = np.minimum(np.quantile(away, 0.98, axis=0), 0.5 * float((high - low).max())) + 1e-3 * (high - low).max()
+    return NearestPoints(cloud, tree, low - margin, high + margin, _CELLS)
 
 
 def _least(largest: Callable[..., Array], symmetries: Sequence[Pose], points: ArrayLike, *arrays: Array) -> Array:

@@ -29,6 +29,7 @@ CLEAR, SOFT = 0.42, 0.7  # the step between inside and outside: half its height,
 SIGMA = 0.5  # pixels, the least standard deviation of a line
 LEAST = 20  # lines
 MIXED, BOTH, EDGE = 2, 2, 30.0  # pixels to either side that mix colours, that show them, and a clear step's grey values
+BAND = 3  # pixels on either side of an edge in which `contrast` looks
 GAP, RING = 1, 14  # pixels beside the outline that no colours are learned from, and how far the surroundings reach
 BLUR = 1.0  # pixels over which neighbouring probabilities are averaged
 HUE = 0.12  # distance of chromaticities beyond which a pixel is not the mesh's
@@ -140,6 +141,23 @@ def outline_lines(
     columns, rows = pixels[usable].astype(int).T
     points = drawn.coords[rows, columns].astype(np.float64) - center
     return Lines(*(array.astype(np.float64) for array in (points, places[usable], normals[usable], sigma[usable])))
+
+
+def contrast(view: View, silhouette: Mask, colours: Colours) -> float:
+    """How well a silhouette (H, W) separates the object's colours from its surroundings' in a frame's crop, -1 to 1.
+
+    The mean probability that a pixel is the object's in a band inside its edge, less that in a band outside; 0 where
+    there is no band.
+    """
+    solid = silhouette.astype(np.uint8)
+    shown = view.shown
+    deep = cv2.erode(solid, _disc(BAND + 1), borderValue=1) > 0
+    inner = (cv2.erode(solid, _disc(1)) > 0) & ~deep & shown
+    outer = (cv2.dilate(solid, _disc(BAND + 1)) > cv2.dilate(solid, _disc(1))) & shown
+    if not inner.any() or not outer.any():
+        return 0.0
+    chance = colours.posterior(view.image)
+    return float(chance[inner].mean() - chance[outer].mean())
 
 
 def find_outline(mask: Mask) -> Outline:

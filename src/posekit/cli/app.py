@@ -17,6 +17,7 @@ from typer.core import TyperGroup
 
 from posekit._version import __version__
 from posekit.cli import (
+    cache,
     calibrate,
     demo,
     detect,
@@ -160,6 +161,7 @@ app.add_typer(train.train, name="train")
 app.command("eval", cls=Command)(eval.evaluate)
 app.command("download", cls=Command)(download.download)
 app.command("calibrate", cls=Command)(calibrate.calibrate)
+app.command("cache", cls=Command)(cache.cache)
 app.command("doctor", cls=Command)(doctor.doctor)
 app.command("demo", cls=Command)(demo.demo)
 

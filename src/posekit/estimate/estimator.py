@@ -6,6 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -111,8 +112,7 @@ class PoseEstimator:
         if not isinstance(networks, Runtime):
             networks = Runtime(preset, weights, device=device, runtime=runtime, networks=networks)
         self.runtime = networks
-        self.predictor: Predictor = networks.predictor
-        self.refine_options = options.refine_options(self.predictor.dense)
+        self.refine_options = options.refine_options(networks.dense)
         self.renderer = Renderer()
         self._search: BoxSearch | FirstPoseSearch | None = None
         self._features = FeatureSearch(model, self.renderer)
@@ -120,6 +120,11 @@ class PoseEstimator:
             from posekit.first_pose.mvnet import mvnet_search
 
             self._search = mvnet_search(model, self.networks, self.renderer)
+
+    @cached_property
+    def predictor(self) -> Predictor:
+        """SV-Net for batches of pairs, made when it is first used."""
+        return self.runtime.predictor
 
     @property
     def weights_hash(self) -> str:

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from posekit.align.pnp import PnpConfig, solve_pnp
 from posekit.camera import Box, Camera
-from posekit.first_pose.mesh_cache import cache_file, keep_arrays, read_arrays
 from posekit.geometry import Pose, cube_views
+from posekit.io.array_cache import keep_arrays, read_arrays
+from posekit.mesh.cache import cache_file
 from posekit.mesh.model import ObjectModel
 from posekit.render import Light, Renderer, centred_poses, view_rotations
 from posekit.view import View

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from posekit.camera import Box, Camera
 from posekit.errors import PromptError
 from posekit.first_pose.evidence import Palette, Picture, Silhouettes, Weights
-from posekit.first_pose.mesh_cache import cache_file, keep_arrays, read_arrays
 from posekit.geometry import (
     Pose,
     fibonacci_sphere,
@@ -26,6 +25,8 @@ from posekit.geometry import (
     so3_exp,
     view_rotation,
 )
+from posekit.io.array_cache import keep_arrays, read_arrays
+from posekit.mesh.cache import cache_file
 from posekit.mesh.model import ObjectModel
 from posekit.render import Light, Renderer
 from posekit.results import Detection

@@ -15,6 +15,7 @@ from scipy.spatial.distance import pdist
 from posekit.errors import MeshError
 from posekit.geometry import Pose, fibonacci_sphere
 from posekit.mesh.atlas import merge
+from posekit.mesh.kept import is_large, keep, kept_file, read_kept
 from posekit.mesh.processing import (
     carried_uvs,
     checked_mesh,
@@ -77,6 +78,13 @@ class ObjectModel:
         path = Path(path)
         if units not in ("auto", *UNITS):
             raise MeshError(f"units are auto, {', '.join(UNITS)}, not {units!r}.")
+        file = kept_file(path, units)
+        model = (file and cls._kept(file, path, units)) or cls._read(path, units, file)
+        return model._with_hull_of(replace(model, symmetries=symmetries_of(symmetry, path, model.center)))
+
+    @classmethod
+    def _read(cls, path: Path, units: str, file: Path | None) -> ObjectModel:
+        """From a mesh file; a large mesh is kept in ``file`` for the next time."""
         merged = merge(read_parts(path), path.name)
         model = cls.from_arrays(
             merged.vertices,
@@ -88,10 +96,33 @@ class ObjectModel:
             normals=merged.normals,
             label=path.name,
         )
-        units = chosen_units(path.name, model.diameter, units)
+        size = model.diameter
+        units = chosen_units(path.name, size, units)
         scaled = (model.vertices * np.float64(UNITS[units])).astype(np.float32)
         model = replace(model, vertices=scaled, units=units)
-        return replace(model, symmetries=symmetries_of(symmetry, path, model.center))
+        if file is not None and model.texture is None and is_large(model.faces):
+            arrays = {name: getattr(model, name) for name in ("vertices", "faces", "normals", "colors")}
+            keep(file, path, arrays | {"hull": model.hull_vertices, "size": np.array(size)})
+        return model
+
+    @classmethod
+    def _kept(cls, file: Path, path: Path, units: str) -> ObjectModel | None:
+        """As `_read` kept it; None where it did not."""
+        arrays = read_kept(file)
+        if arrays is None:
+            return None
+        units = chosen_units(path.name, float(arrays["size"]), units)
+        model = cls(
+            path.stem, arrays["vertices"], arrays["faces"], arrays["normals"], arrays.get("colors"), units=units
+        )
+        vars(model)["hull_vertices"] = arrays["hull"]
+        return model
+
+    def _with_hull_of(self, other: ObjectModel) -> ObjectModel:
+        """Another model of the same vertices, with this one's hull where it is known."""
+        if "hull_vertices" in vars(self):
+            vars(other)["hull_vertices"] = self.hull_vertices
+        return other
 
     @classmethod
     def from_arrays(
@@ -168,7 +199,8 @@ class ObjectModel:
         """The largest distance of two vertices; within 0.1 % of it where the hull has thousands of corners."""
         points = self.hull_vertices
         if len(points) > 4000:
-            points = points[np.unique((points @ fibonacci_sphere(4000).T).argmax(axis=0))]
+            parts = np.array_split(fibonacci_sphere(4000), 16)  # one matrix for all would take much memory
+            points = points[np.unique(np.concatenate([(part @ points.T).argmax(axis=1) for part in parts]))]
         return float(pdist(points).max())
 
     @cached_property
@@ -194,8 +226,9 @@ class ObjectModel:
         """
         if len(self.faces) <= faces:
             return self
-        places = coincident(self.vertices.astype(np.float64))
-        _, first, welded = np.unique(places, return_index=True, return_inverse=True)
+        welded = coincident(self.vertices.astype(np.float64))
+        first = np.empty(int(welded.max()) + 1, dtype=np.int64)
+        first[welded[::-1]] = np.arange(len(welded))[::-1]
         vertices, kept = fast_simplification.simplify(
             self.vertices[first], welded[self.faces].astype(np.int32), target_count=faces
         )

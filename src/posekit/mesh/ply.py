@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,6 +92,8 @@ def _cut(data: bytes, start: int, elements: list[_Element], label: str) -> bytes
     before, after = (_scalars(part) for part in (element.properties[: lists[0]], element.properties[lists[0] + 1 :]))
     if len(lists) > 1:
         return data
+    if _all_alike(data, at, element.count, before, np.dtype(counted), np.dtype(kind), after):
+        return data
     heads, counts, after_rows = _walk(data, at, element.count, (before.itemsize, counted, kind, after.itemsize))
     if len(set(counts.tolist())) < 2:
         return data
@@ -120,6 +123,29 @@ def _cut(data: bytes, start: int, elements: list[_Element], label: str) -> bytes
 
 def _scalars(properties: list[tuple[str, str, str | None]]) -> np.dtype[np.void]:
     return np.dtype([(f"{k}", kind) for k, (_, kind, _) in enumerate(properties)])
+
+
+def _all_alike(
+    data: bytes,
+    at: int,
+    count: int,
+    before: np.dtype[np.void],
+    counted: np.dtype[Any],
+    kind: np.dtype[Any],
+    after: np.dtype[np.void],
+) -> bool:
+    """Whether all faces have as many corners as the first, so that none needs cutting: their rows then follow each
+    other at equal distances."""
+    place = at + before.itemsize
+    if not count or place + counted.itemsize > len(data):
+        return False
+    corners = int(np.frombuffer(data, counted, 1, place)[0])
+    row = before.itemsize + counted.itemsize + corners * kind.itemsize + after.itemsize
+    if corners < 0 or at + count * row > len(data):
+        return False
+    rows = np.frombuffer(data, np.uint8, count * row, at).reshape(count, row)
+    counts = rows[:, before.itemsize : before.itemsize + counted.itemsize]
+    return bool((counts == counts[0]).all())
 
 
 def _walk(

@@ -6,12 +6,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array
 from scipy.spatial import ConvexHull, KDTree
 
 from posekit.errors import MeshError
 
 _FARTHEST = 1e12  # of a vertex from the origin, in a file's own units
 _CREASE = np.cos(np.deg2rad(40.0))  # faces that meet more sharply are not smoothed together
+_STEPS = 10_000  # in which a normal's coordinates are told apart
+_PORTION = 200_000  # faces or corners that are worked on at a time, for the memory's sake
 
 Floats = NDArray[np.float64]
 
@@ -24,34 +27,74 @@ def smooth_normals(vertices: Floats, faces: NDArray[np.int64]) -> tuple[NDArray[
     """
     flat, angles = _face_normals(vertices, faces)
     place = coincident(vertices)[faces.ravel()]
-    order = np.argsort(place, kind="stable")
-    normal = np.repeat(flat, 3, axis=0)[order]  # of each corner's face; corners of one place lie side by side
-    weighted = normal * angles.ravel()[order, None]
-    ends = np.searchsorted(place[order], place[order], side="right")
-    total, left, step = weighted.copy(), np.arange(len(order)), 1
+    order = counting_order(place)
+    place = place[order]
+    ends = np.cumsum(np.bincount(place))  # of the corners of each place, which lie side by side
+    unit = np.empty((len(order), 3))
+    start = 0
+    while start < len(order):
+        end = int(ends[place[min(start + _PORTION, len(order)) - 1]])
+        part = order[start:end]
+        unit[part] = _smoothed(flat[part // 3], angles.ravel()[part], ends[place[start:end]] - start)
+        start = end
+    first, inverse = _distinct(faces.ravel(), np.rint(unit * _STEPS).astype(np.int64))
+    return faces.ravel()[first], inverse.reshape(-1, 3), unit[first]
+
+
+def _smoothed(normal: Floats, angle: Floats, ends: NDArray[np.int64]) -> Floats:
+    """Unit normals (N, 3) of corners, from their faces' normals (N, 3) and their angles (N,), each place's side by
+    side; ends: (N,), where those of a corner's place end."""
+    weighted = normal * angle[:, None]
+    total, left, step = weighted.copy(), np.arange(len(normal)), 1
     while left.size:  # each corner meets the one that lies `step` further on at the same place
         left = left[left + step < ends[left]]
         smooth = left[np.einsum("ij,ij->i", normal[left], normal[left + step]) > _CREASE]
         total[smooth] += weighted[smooth + step]
         total[smooth + step] += weighted[smooth]
         step += 1
-    unit = np.empty_like(total)
     length = np.linalg.norm(total, axis=1, keepdims=True)
-    unit[order] = np.where(length > 1e-9, total, normal) / np.where(length > 1e-9, length, 1.0)
-    keys = np.column_stack([faces.ravel(), np.rint(unit * 1e4).astype(np.int64)])
-    _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    return faces.ravel()[first], inverse.reshape(-1, 3), unit[first]
+    return np.asarray(np.where(length > 1e-9, total, normal) / np.where(length > 1e-9, length, 1.0))
+
+
+def _distinct(vertex: NDArray[np.int64], normal: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The distinct pairs of a vertex (N,) and a normal (N, 3) in units of 1 / `_STEPS`, sorted: where each is first,
+    and which of them each pair is."""
+    side = 2 * _STEPS + 1
+    if (int(vertex.max(initial=0)) + 1) * side**3 >= 2**64:
+        keys = np.column_stack([vertex, normal])
+        _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        return first, inverse.ravel()
+    key = vertex.astype(np.uint64)
+    for axis in range(3):
+        key *= np.uint64(side)
+        key += (normal[:, axis] + _STEPS).astype(np.uint64)
+    order = np.argsort(key)
+    key = key[order]
+    new = np.concatenate([[True], key[1:] != key[:-1]])
+    inverse = np.empty(len(key), dtype=np.int64)
+    inverse[order] = np.cumsum(new) - 1
+    return np.minimum.reduceat(order, np.flatnonzero(new)), inverse
+
+
+def counting_order(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+    """As ``np.argsort(numbers, kind="stable")`` of whole numbers from 0 on without large gaps, in linear time."""
+    ones, rows = np.ones(len(numbers), dtype=np.int8), np.arange(len(numbers) + 1)
+    return np.asarray(csr_array((ones, numbers, rows)).tocsc().indices)  # one number in each row, and rows by column
 
 
 def _face_normals(vertices: Floats, faces: NDArray[np.int64]) -> tuple[Floats, Floats]:
     """Unit normals (F, 3) and the angles (F, 3) at the corners."""
-    corners = vertices[faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    edges = np.roll(corners, -1, axis=1) - corners
-    edges /= np.maximum(np.linalg.norm(edges, axis=2, keepdims=True), 1e-300)
-    cosines = -np.einsum("fij,fij->fi", edges, np.roll(edges, 1, axis=1))
-    return normals, np.arccos(cosines.clip(-1, 1))
+    normals, angles = np.empty((len(faces), 3)), np.empty((len(faces), 3))
+    for start in range(0, len(faces), _PORTION):
+        part = slice(start, start + _PORTION)
+        corners = vertices[faces[part]]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals[part] = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        edges = np.roll(corners, -1, axis=1) - corners
+        edges /= np.maximum(np.linalg.norm(edges, axis=2, keepdims=True), 1e-300)
+        cosines = -np.einsum("fij,fij->fi", edges, np.roll(edges, 1, axis=1))
+        angles[part] = np.arccos(cosines.clip(-1, 1))
+    return normals, angles
 
 
 def coincident(vertices: Floats) -> NDArray[np.int64]:
@@ -66,16 +109,19 @@ def coincident(vertices: Floats) -> NDArray[np.int64]:
 
 def face_areas(vertices: Floats, faces: NDArray[Any]) -> Floats:
     """Areas (F,) of faces (F, 3) of vertices (V, 3), in the vertices' unit squared."""
-    corners = vertices[faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return np.asarray(0.5 * np.linalg.norm(cross, axis=1))
+    areas = np.empty(len(faces))
+    for start in range(0, len(faces), _PORTION):
+        corners = vertices[faces[start : start + _PORTION]]
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        areas[start : start + _PORTION] = 0.5 * np.linalg.norm(cross, axis=1)
+    return areas
 
 
 def mean_colors(
     fewer: NDArray[np.float32], vertices: NDArray[np.float32], colors: NDArray[np.uint8]
 ) -> NDArray[np.uint8]:
     """Of the vertices that each of fewer ones (V, 3) is nearest to; where there are none, of the nearest."""
-    _, owner = KDTree(fewer).query(vertices)
+    _, owner = KDTree(fewer).query(vertices, workers=-1)
     count = np.bincount(owner, minlength=len(fewer))
     sums = np.stack([np.bincount(owner, channel, minlength=len(fewer)) for channel in colors.T], axis=1)
     _, nearest = KDTree(vertices).query(fewer)

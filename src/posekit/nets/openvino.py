@@ -17,6 +17,7 @@ import numpy as np
 import openvino
 
 from posekit._version import __version__
+from posekit.io.cache_folder import make_room
 from posekit.io.files import user_cache
 from posekit.nets.inputs import relief, to_input
 from posekit.nets.precision import usable_cores
@@ -25,6 +26,9 @@ from posekit.view import View
 
 if TYPE_CHECKING:
     from posekit.nets.lite import LiteSVNet
+
+KEPT_NETWORKS = 3  # converted ones: of other weights, or other versions
+KEPT_BLOBS = 8  # compiled ones: for other numbers of threads and streams too
 
 
 class OpenVinoPredictor:
@@ -55,8 +59,9 @@ class OpenVinoPredictor:
             "NUM_STREAMS": str(streams),
         }
         if digest != "untrained":  # what is compiled for this processor is kept, too
-            options["CACHE_DIR"] = str(user_cache("openvino") / "compiled")
+            options["CACHE_DIR"] = str(user_cache("openvino/compiled"))
         compiled = openvino.Core().compile_model(_converted(svnet, digest), "CPU", options)
+        make_room(user_cache("openvino/compiled").glob("*.blob"), KEPT_BLOBS)
         self._queue = openvino.AsyncInferQueue(compiled, streams)
         self._queue.set_callback(self._done)
         self._answers: dict[int, list[Any]] = {}
@@ -126,5 +131,6 @@ def _keep(model: Any, folder: Path) -> None:
     try:
         openvino.save_model(model, part / "svnet.xml", compress_to_fp16=False)
         part.rename(folder)
+        make_room((p for p in folder.parent.iterdir() if (p / "svnet.xml").is_file()), KEPT_NETWORKS)
     finally:
         shutil.rmtree(part, ignore_errors=True)

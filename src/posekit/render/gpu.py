@@ -183,8 +183,9 @@ def _drawing_order(vertices: NDArray[np.float64], faces: NDArray[Any]) -> tuple[
     middles = vertices[faces].mean(axis=1)
     span = max(float(np.ptp(middles, axis=0).max()), 1e-12)
     cells = ((middles - middles.min(axis=0)) * (1023 / span)).astype(np.int64)
-    bits = (cells[:, None, :] >> np.arange(10)[None, :, None]) & 1
-    code = (bits.reshape(len(faces), 30) << np.arange(30)).sum(axis=1)
+    code = np.zeros(len(faces), np.int64)
+    for bit in range(30):  # of the three coordinates in turn
+        code |= ((cells[:, bit % 3] >> bit // 3) & 1) << bit
     corners = faces[np.argsort(code, kind="stable")].ravel()
     _, first = np.unique(corners, return_index=True)
     used = corners[np.sort(first)].astype(np.intp)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from posekit.camera import Camera
 from posekit.errors import RenderError
 from posekit.geometry import Pose
+from posekit.mesh.light import drawn_copy
 from posekit.mesh.model import ObjectModel
 from posekit.render import context
 from posekit.render.gpu import Draw, Mesh, Pass, Program, Target
@@ -31,6 +32,7 @@ class Renderer:
     samples: 0, 2, 4 or 8 colour samples a pixel (fewer where OpenGL offers fewer). They smooth the image only,
     whose edges fade to black; mask, depth and coords are always those of the pixel's centre.
     backend: "auto", "egl" or "osmesa". Threads may share a Renderer; they take turns.
+    Meshes of more than 100,000 faces are drawn simplified, exactly enough for the picture (see `drawn_copy`).
     Raises ValueError for other samples, RenderError where there is no usable OpenGL.
     """
 
@@ -73,7 +75,8 @@ class Renderer:
         size = self._check_size(all_cameras)
         with context.current(self._backend) as current:
             current.gl.enable_only(moderngl.DEPTH_TEST)
-            mesh, target = self._mesh(current.gl, model), self._target(current.gl, size)
+            mesh = self._mesh(current.gl, drawn_copy(model, max(size)))
+            target = self._target(current.gl, size)
             return [
                 self._view(target, mesh, mesh.draw(pose, camera, each), camera, rgb=rgb, coords=coords)
                 for pose, camera, each in zip(poses, all_cameras, lights, strict=True)

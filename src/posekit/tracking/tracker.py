@@ -17,7 +17,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from posekit.align.colour_edge import Colours, Tint, learn, like_mesh, off_colour, outline_lines
+from posekit.align.colour_edge import Colours, Tint, contrast, learn, like_mesh, off_colour, outline_lines
 from posekit.align.gauss_newton import GaussianPose, Points, Residual, fuse
 from posekit.camera import Camera
 from posekit.errors import CameraError, ConfigError
@@ -42,6 +42,11 @@ PREDICTED = (10.0, 8.0, 0.05)  # of the motion between two frames, where they ar
 UNPREDICTED = (6.0, 4.0, 0.02)  # of that motion, when nothing else is known about it
 LEAST_STD = (0.5, 0.15, 0.004)  # of any pose, at least: errors last over many frames
 CORRELATED = 25.0  # number of correspondences whose errors are correlated
+CLEAR = 0.3  # contrast of an outline that is evidence by itself
+MOST_GROWN = 1.5  # pixels that an outline may look larger or smaller
+# pixels of the crop: a disagreement of the network alone that halves its weight, and the largest that counts; share of
+# a frame in what is known of it
+BIASED, MOST_BIASED, BIAS_RATE = 1.0, 2.0, 0.2
 ANGLE_OF_DOUBLE = math.radians(4.0)  # predicted angle at which that number doubles
 TINT_RATE = 0.15  # weight of a frame in the running tint
 FACES = 6000  # of the mesh that is drawn: a crop shows no more
@@ -65,6 +70,10 @@ class TrackConfig:
     still_deg: float = 0.0
     converged_deg: float = 2.0  # the predicted angle below which an estimate counts as converged
     again_deg: float = 8.0
+    # by which the crops are smaller in which the outline is looked for before a frame is compared, coarse to fine;
+    # none: it is not looked for
+    scales: tuple[int, ...] = (4, 2, 1)
+    margin: float = 0.02  # by which the outline's pose has to separate the colours better than the predicted one
     iterations: int = 1  # comparisons of a frame at most; a second one follows a turn of more than ``again_deg``
     # where a frame's comparison starts: where followed points lead ("points"), the share ``prior`` of the last motion
     # once more ("velocity"), or the last pose ("none")
@@ -164,6 +173,9 @@ class Tracker:
         self._colours: Colours | None = None
         self._tint: Tint | None = None
         self._doubts = 0
+        self._separated = self._separated_first = 0.0  # contrast of the last silhouette and of the first
+        self._grown = dict.fromkeys({1, *config.scales}, 0.0)  # pixels, see `_growth`
+        self._bias = 0.0  # pixels of the crop: how far the network alone has been from what all evidence gave
         self._waiting = 0  # frames until the next search
 
     def step(
@@ -181,6 +193,7 @@ class Tracker:
             if self._begin(view, pose, math.radians(GIVEN[0])):
                 assert self._before is not None
                 prediction, network = self._compared(self._before.seen, self._before.drawn, self._before.visible)
+                self._bias = self._disagreement(self._before, prediction, self._before.T_view_ctr)
                 timings = {"network": network, "total": time.perf_counter() - started}
                 given = self._estimate(view, pose, prediction.angle, 0, 1.0, timings)
                 return Tracked(TRACKED, self._on_branch(given, Branch.GIVEN))
@@ -211,14 +224,30 @@ class Tracker:
         self._colours = learn(seen, drawn.mask, visible)
         self._tint = Tint.of(off_colour(seen, drawn), visible & drawn.mask)
         self._before = Keyframe(seen, drawn, Pose.rotation(seen.R_view_cam) @ centred, visible)
+        self._separated = self._separated_first = contrast(seen, drawn.mask, self._colours)
+        self._grown = {scale: self._growth(view, pose, scale) for scale in {1, *self.config.scales}}
         return True
+
+    def _growth(self, view: View, pose: Pose, scale: int) -> float:
+        """By how many pixels of a crop that is smaller by ``scale`` the outline that the colours show lies outside that
+        of a first pose, in the median: soft edges and blur make an object look larger or smaller than it is drawn."""
+        assert self._colours is not None
+        width, height = self.predictor.size
+        size = (width // scale, height // scale)
+        [seen], [drawn] = crops(view, self._drawn, self._outline, [pose], size, self.renderer)
+        lines = outline_lines(seen, drawn, self._colours, self._colours.seen(seen), self.model.center)
+        if lines is None:
+            return 0.0
+        there = Pose.rotation(seen.R_view_cam) @ pose @ self.model.T_obj_ctr
+        off = ((lines.places - drawn.camera.project(there.apply(lines.points))) * lines.normals).sum(axis=1)
+        return float(np.clip(np.median(off), -MOST_GROWN, MOST_GROWN))
 
     def _follow(self, view: View, last: GaussianPose) -> Estimate | None:
         """From where the object is expected; None where it cannot be compared."""
         started, network, angle, comparisons = time.perf_counter(), 0.0, 0.0, 0
         before, colours, tint = self._before, self._colours, self._tint
         assert before is not None and colours is not None and tint is not None
-        predicted = self._predicted(view, before, last, colours)
+        predicted = self._outlined(view, self._predicted(view, before, last, colours), last, colours)
         state = predicted
         while comparisons < self.config.iterations:
             comparisons += 1
@@ -242,6 +271,8 @@ class Tracker:
             if combined is None:
                 return None
             turn = math.degrees(rotation_angle(combined.pose.R @ state.pose.R.T))
+            there = Pose.rotation(seen.R_view_cam) @ combined.pose
+            self._bias += BIAS_RATE * (self._disagreement(keyframe, prediction, there) - self._bias)
             state = combined
             if turn < self.config.again_deg:
                 break
@@ -253,7 +284,10 @@ class Tracker:
         share = float((visible & shown).sum() / max(1, shown.sum()))
         self._motion = Pose(state.pose.R @ last.pose.R.T, state.pose.t - last.pose.t)
         self._state, self._before = state, keyframe
-        if angle < math.radians(self.config.restart_deg) and share > self.config.min_colour_share:
+        self._separated = contrast(seen, drawn.mask, colours)
+        if (
+            angle < math.radians(self.config.restart_deg) or self._outline_holds()
+        ) and share > self.config.min_colour_share:
             self._colours = new_colours
         self._tint = new_tint
         timings = {"network": network, "total": time.perf_counter() - started}
@@ -277,6 +311,51 @@ class Tracker:
         moved = np.sum([residual.equations(pose, camera)[0] for residual in motion], axis=0)
         covariance = in_view.covariance / self.config.keep + np.linalg.inv(moved)
         return GaussianPose(pose, np.asarray(np.linalg.inv(covariance))).turned(R.T)
+
+    def _outlined(self, view: View, predicted: GaussianPose, last: GaussianPose, colours: Colours) -> GaussianPose:
+        """``predicted`` (``T_cam_ctr``) moved to where the frame's colours show the outline, from coarse to fine. The
+        last motion once more is another start, since quick motion leaves followed points behind. Of these poses and
+        the predicted one that is taken whose silhouette separates the colours best."""
+        if not self.config.scales or not self.config.outline:
+            return predicted
+        starts = [predicted.pose]
+        if not _moved_little(self._motion, predicted.pose, self._before):
+            starts.append(Pose(self._motion.R @ last.pose.R, last.pose.t + self._motion.t))
+        *coarse, fine = self.config.scales
+        aligned = [self._aligned(view, replace(predicted, pose=start), colours, coarse) for start in starts]
+        qualities = [self._separation(view, each.pose, colours) for each in (predicted, *aligned)]
+        best = int(np.argmax(np.array(qualities) - [0.0, *[self.config.margin] * len(aligned)]))
+        return self._aligned(view, (predicted, *aligned)[best], colours, [fine])
+
+    def _separation(self, view: View, T_cam_ctr: Pose, colours: Colours) -> float:
+        """How well the silhouette of a pose separates the colours, see `contrast`."""
+        pose = T_cam_ctr @ self.model.T_ctr_obj
+        if not self._in_front(pose):
+            return -1.0
+        seen, drawn = self._crops(view, pose, coords=False)
+        assert drawn.mask is not None
+        return contrast(seen, drawn.mask, colours)
+
+    def _aligned(self, view: View, start: GaussianPose, colours: Colours, scales: Sequence[int]) -> GaussianPose:
+        """A ``T_cam_ctr`` fitted to the outline in ever finer crops of a frame, held near its start by its
+        information."""
+        state = start
+        width, height = self.predictor.size
+        for scale in scales:
+            pose = state.pose @ self.model.T_ctr_obj
+            if not self._in_front(pose):
+                return start
+            size = (width // scale, height // scale)
+            [seen], [drawn] = crops(view, self._drawn, self._outline, [pose], size, self.renderer)
+            lines = outline_lines(seen, drawn, colours, colours.seen(seen), self.model.center)
+            if lines is None:
+                continue
+            lines = replace(lines, places=lines.places - self._grown[scale] * lines.normals)
+            R = seen.R_view_cam
+            fitted = fuse(Pose.rotation(R) @ state.pose, [start.turned(R), lines], drawn.camera, steps=3)
+            if fitted is not None:
+                state = replace(start, pose=Pose.rotation(R.T) @ fitted.pose)
+        return state
 
     def _expected(self, last: Pose, R_view_cam: NDArray[np.float64]) -> Pose:
         """``T_view_ctr`` after the last motion, where that is to be repeated."""
@@ -304,7 +383,8 @@ class Tracker:
         return [] if found is None else [found]
 
     def _texture(self, keyframe: Keyframe) -> list[Residual]:
-        found = match_texture(keyframe, self.model) if self.config.texture else None
+        coloured = self.model.colors is not None or self.model.texture is not None
+        found = match_texture(keyframe, self.model) if self.config.texture and coloured else None
         return [] if found is None else [found]
 
     def _lines(self, keyframe: Keyframe, seen: View, visible: NDArray[np.bool_], colours: Colours) -> list[Residual]:
@@ -312,11 +392,12 @@ class Tracker:
         if not self.config.outline:
             return []
         lines = outline_lines(seen, keyframe.drawn, colours, visible, self.model.center, keyframe.outline)
-        return [] if lines is None else [lines]
+        return [] if lines is None else [replace(lines, places=lines.places - self._grown[1] * lines.normals)]
 
-    def _crops(self, view: View, pose: Pose) -> tuple[View, View]:
+    def _crops(self, view: View, pose: Pose, *, coords: bool = True) -> tuple[View, View]:
         """What the frame shows round a ``T_cam_obj``, and the mesh drawn there."""
-        [seen], [drawn] = crops(view, self._drawn, self._outline, [pose], self.predictor.size, self.renderer)
+        size = self.predictor.size
+        [seen], [drawn] = crops(view, self._drawn, self._outline, [pose], size, self.renderer, coords=coords)
         return seen, drawn
 
     def _compared(self, seen: View, drawn: View, visible: NDArray[np.bool_]) -> tuple[PairPrediction, float]:
@@ -338,9 +419,21 @@ class Tracker:
         points = keyframe.drawn.coords[found.source[:, 1], found.source[:, 0]] - self.model.center
         if not len(points):
             return []
-        correlated = CORRELATED * (1 + (prediction.angle / ANGLE_OF_DOUBLE) ** 2)
+        doubt = (1 + (prediction.angle / ANGLE_OF_DOUBLE) ** 2) * (1 + (self._bias / BIASED) ** 2)
         scale = np.maximum(found.scale_px, LEAST_SCALE)
-        return [Points(points.astype(np.float64), found.target, found.weight, scale, KNEE, correlated)]
+        return [Points(points.astype(np.float64), found.target, found.weight, scale, KNEE, CORRELATED * doubt)]
+
+    def _disagreement(self, keyframe: Keyframe, prediction: PairPrediction, T_view_ctr: Pose) -> float:
+        """How far, in pixels of the crop, the object's points lie in the pose that the network alone gives from where
+        they lie in the ``T_view_ctr`` that all evidence gave; the mean over the convex hull's corners."""
+        camera, bias, self._bias = keyframe.drawn.camera, self._bias, 0.0
+        network = self._network(keyframe, prediction)
+        self._bias = bias
+        alone = fuse(T_view_ctr, [_about(T_view_ctr, camera, (30.0, 20.0, 0.2)), *network], camera)
+        if alone is None:
+            return bias
+        there, here = (camera.project(_before_camera(pose.apply(self._outline))) for pose in (alone.pose, T_view_ctr))
+        return min(MOST_BIASED, float(np.linalg.norm(there - here, axis=1).mean()))
 
     def _estimate(
         self, view: View, pose: Pose, angle: float, iterations: int, score: float, timings: dict[str, float]
@@ -372,10 +465,17 @@ class Tracker:
         in_doubt = (
             share < self.config.least_inside
             or found.score < self.config.min_colour_share
-            or math.degrees(found.angle) > self.config.restart_deg
+            or (math.degrees(found.angle) > self.config.restart_deg and not self._outline_holds())
         )
         self._doubts = self._doubts + 1 if in_doubt else 0
         return share == 0 or self._doubts >= self.config.doubts
+
+    def _outline_holds(self) -> bool:
+        """Whether the last frame's silhouette separates the colours at least half as well as the first one's did.
+
+        Then the predicted angle alone is no reason for doubt: on a mesh without colours, or a shining one, it says
+        little."""
+        return self._separated_first > CLEAR and self._separated > 0.5 * self._separated_first
 
     def _reset(self) -> None:
         self._state = self._before = self._colours = None
@@ -399,6 +499,12 @@ class Tracker:
 def _about(pose: Pose, camera: Camera, spread: tuple[float, float, float]) -> GaussianPose:
     turn, shift, depth = spread
     return GaussianPose.about(pose, camera, math.radians(turn), shift, depth)
+
+
+def _moved_little(motion: Pose, pose: Pose, before: Keyframe | None) -> bool:
+    """Whether the last motion is below a pixel of the crop, so that to repeat it changes nothing."""
+    camera = None if before is None else before.drawn.camera
+    return camera is None or float(np.linalg.norm(motion.t)) * camera.fx / max(float(pose.t[2]), 1e-6) < 1.0
 
 
 def _predictor(estimator: PoseEstimator, config: TrackConfig) -> Predictor:
