@@ -79,8 +79,9 @@ def _train(config: TrainConfig, out: Path, show: Show | None) -> list[dict[str, 
     if rows and config.calibrate:
         if count < config.calibrate:
             log.info(
-                "the predicted angle is %scalibrated (%d of %d renderings): the %g minutes allow no more. To do it on all: "
-                "posekit train angle --weights %s.", "" if count else "not ", count, config.calibrate, config.minutes, out,
+                "the predicted angle is %scalibrated (%d of %d renderings): the %g minutes allow no more. To do it on "
+                "all: posekit train angle --weights %s.",
+                "" if count else "not ", count, config.calibrate, config.minutes, out,
             )  # fmt: skip
         if count:
             _calibrate(dataclasses.replace(config, calibrate=count), sources, config.recipe, out, out, show)
