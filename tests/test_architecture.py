@@ -15,7 +15,7 @@ SOURCE = Path(__file__).resolve().parent.parent / "src" / "posekit"
 # Rooms that are planned stand here too; a room that is built must stand here.
 LAYERS = {
     0: {"geometry", "camera", "lens"},
-    1: {"view", "results", "nearest"},
+    1: {"view", "results", "machines", "nearest"},
     2: {"io", "metrics"},
     3: {"mesh"},
     4: {"zoom", "render", "nets", "object_model"},
@@ -23,7 +23,7 @@ LAYERS = {
     6: {"detect", "first_pose"},
     7: {"estimate", "datasets"},
     8: {"tracking", "synth"},
-    9: {"evaluate", "train", "api", "viewer"},
+    9: {"evaluate", "train", "api", "viewer", "batch"},
     10: {"cli"},
     11: {"__main__"},
 }

@@ -22,8 +22,8 @@ import numpy as np
 import pytest
 
 from objects import bracket
+from posekit.batch.prompts import prompt_for
 from posekit.camera import Camera
-from posekit.cli.prompts import prompt_for
 from posekit.errors import CameraError
 from posekit.io.calibration import load_calibration
 from posekit.io.load import load_view

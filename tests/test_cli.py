@@ -475,7 +475,7 @@ FACES = ["3 0 1 2", "3 0 1 3", "3 0 2 3", "3 1 2 3"]
 # of the message.
 BAD_INPUT: list[tuple[str, str, Callable[[Path, Path], object], tuple[str, ...]]] = [
     ("no image", "image", lambda d, _: d / "nowhere.png", ("nowhere.png", "check the path")),
-    ("a folder", "image", lambda d, _: d, ("folder",)),
+    ("a folder", "image", lambda d, _: d, ("holds no pictures",)),
     ("no picture", "image", lambda d, _: text(d / "notes.png", "hello"), ("notes.png", "not a picture")),
     ("truncated", "image", lambda d, good: cut(d / "cut.png", good / "photo.png"), ("cut.png", "damaged")),
     ("0x0 pixels", "image", lambda d, _: png_header(d / "none.png", 0, 0), ("none.png",)),

@@ -26,12 +26,13 @@ from posekit.datasets.bop_writer import write_models
 from posekit.datasets.results_csv import ResultRow, results_csv
 from posekit.datasets.symmetry import detect_symmetries
 from posekit.errors import ConfigError, InputError, OutputError
+from posekit.machines import Machines
 from posekit.mesh.model import ObjectModel
 from posekit.metrics import pose_error
 from posekit.render import Renderer
 from posekit.synth.backdrops import Backdrops
 from posekit.synth.plan import SynthConfig
-from posekit.synth.run import Machines, begin, run
+from posekit.synth.run import begin, run
 
 SIZE = (160, 120)
 QUIET = lambda done, total: None  # noqa: E731
@@ -125,8 +126,8 @@ def test_killed_and_resumed_is_never_killed(tmp_path: Path) -> None:
     make(tmp_path / "whole", what)
     root = tmp_path / "killed"
     begin(what, root, objects())
-    code = "import sys; from pathlib import Path; from posekit.synth.run import Machines, run\n" \
-           "run(Path(sys.argv[1]), Machines(), lambda done, total: None)"  # fmt: skip
+    code = "import sys; from pathlib import Path; from posekit.machines import Machines\n" \
+           "from posekit.synth.run import run; run(Path(sys.argv[1]), Machines(), lambda *_: None)"  # fmt: skip
     for wanted in (3, 17):
         process = subprocess.Popen([sys.executable, "-c", code, str(root)], start_new_session=True)
         records = root / ".records" / "train"

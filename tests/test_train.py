@@ -20,7 +20,7 @@ import sys
 import tempfile
 import time
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -66,7 +66,7 @@ from posekit.train.data.view_queries import QueryConfig
 from posekit.train.loop import Trainer, make_fabric, rate_at
 from posekit.train.measure import CaseSource, rendered_cases
 from posekit.train.paper import PaperTask
-from posekit.train.pose import make_task, resume_pose, train_pose
+from posekit.train.pose import _calibration_cases, make_task, resume_pose, train_pose
 from posekit.train.sources import Sources
 
 SMALL = LiteConfig(widths=(16, 32), blocks=1, fine=16)
@@ -145,7 +145,79 @@ def test_a_whole_run_leaves_weights_curves_and_checkpoints(tmp_path: Path) -> No
 def test_a_training_for_minutes_ends_by_the_clock(tmp_path: Path) -> None:
     config = dataclasses.replace(CONFIG, steps=10**6, minutes=1 / 60, cases=0, save=10**6)
     rows = train_pose(config, tmp_path / "run")
-    assert 1.0 <= float(rows[-1]["seconds"]) < 30
+    assert rows[-1]["step"] != "0" and float(rows[-1]["seconds"]) < 30
+
+
+class TimedModule(torch.nn.Module):
+    """A line in place of a network; every part of the training takes its seconds of a clock that stands still else."""
+
+    def __init__(self, clock: Clock, step: float) -> None:
+        super().__init__()
+        self.nets, self.clock, self.step = torch.nn.Linear(1, 1), clock, step
+
+    def forward(self, batch: dict[str, torch.Tensor], seed: int) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        self.clock.now += self.step
+        return self.nets(batch["x"]).square().mean(), {}
+
+
+@dataclasses.dataclass
+class Clock:
+    now: float = 1000.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+
+class TimedTask:
+    measured = 0
+
+    def __init__(self, clock: Clock, step: float, validation: float, export: float) -> None:
+        self.clock, self.validation, self.exporting = clock, validation, export
+        self.module = TimedModule(clock, step)
+        self.nets = self.module.nets
+        self.exported: list[int] = []
+
+    def stream(self, start: int, rank: int) -> Any:
+        return itertools.repeat({"x": torch.ones(1, 1)})
+
+    def prepare(self, batches: Sequence[Any]) -> None: ...
+
+    def validate(self, nets: torch.nn.Module) -> dict[str, float]:
+        self.clock.now += self.validation
+        return {"score": 1.0}
+
+    def export(self, nets: torch.nn.Module, out: Path, about: Mapping[str, Any]) -> None:
+        self.clock.now += self.exporting
+        self.exported.append(about["steps"])
+
+
+@pytest.mark.parametrize(("validation", "after", "steps"), [(20.0, 0.0, 61), (20.0, 15.0, 46), (200.0, 0.0, 1)])
+def test_minutes_include_the_last_validation_and_export(
+    validation: float, after: float, steps: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two minutes, of which ten seconds went by before the loop. One step is made in any case."""
+    clock = Clock()
+    monkeypatch.setattr("posekit.train.loop.time", clock)
+    config = dataclasses.replace(CONFIG, steps=10**6, minutes=2.0, validate=10**6, save=10**6, export_seconds=0)
+    task = TimedTask(clock, 1.0, validation, 3.0)
+    monkeypatch.setattr("posekit.train.loop.loader", lambda stream, *_: iter(stream))
+    told: list[str] = []
+    it = Trainer(config, task, make_fabric(config), tmp_path, lambda progress: told.append(progress.label))
+    clock.now += 10
+    rows = it.run(1000.0, lambda seconds: after)
+    assert [int(row["step"]) for row in rows] == [0, steps] and task.exported == [0, steps]
+    assert it.checkpoints.last() == steps
+    if validation < 100:
+        assert 120 - after - 6 < clock.now - 1000 <= 120 - after, "ends in time, and not much before"
+    assert [label for label, _ in itertools.groupby(told)] == ["validation", "export", "", "validation", "export"]
+
+
+def test_the_calibration_fits_into_the_minutes() -> None:
+    config = dataclasses.replace(CONFIG, minutes=2.0, cases=24, calibrate=240)
+    assert _calibration_cases(config, validation=1.6) == (240, pytest.approx(24.0)), "all, within a quarter"
+    assert _calibration_cases(config, validation=4.8) == (100, pytest.approx(30.0)), "as many as a quarter allows"
+    assert _calibration_cases(config, validation=48.0) == (0, 0.0), "too few to learn from"
+    assert _calibration_cases(config, validation=4.8, left=60.0) == (200, pytest.approx(60.0))
 
 
 # --- killed ---

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, overload
 
@@ -16,16 +15,16 @@ from posekit.camera import Camera
 from posekit.detect import BoxPrompt, MaskPrompt, from_supervision
 from posekit.detect.prompts import clip_box
 from posekit.errors import ImageError, OutputError, PromptError
+from posekit.estimate.document import result_json
 from posekit.estimate.estimator import EstimateOptions, PoseEstimator
 from posekit.estimate.instances import find_instances
 from posekit.geometry import Pose
 from posekit.io.calibration import Calibration, load_calibration
-from posekit.io.documents import camera_entry
 from posekit.io.files import write_bytes_atomic, write_text_atomic
 from posekit.io.load import ASSUMED_FOV, load_mask, load_view
 from posekit.lens import Lens
 from posekit.mesh.model import ObjectModel
-from posekit.results import Detection, Estimate, estimates_to_json
+from posekit.results import Detection, Estimate
 from posekit.view import View
 from posekit.visualise import draw, figures
 
@@ -149,18 +148,6 @@ def estimate(
         where = _found(view, estimator, box, mask)
     [found] = find_instances(lambda _: estimator, view, [estimator.model], where)
     return Result(view, estimator, tuple(found.instances))
-
-
-def result_json(
-    view: View, estimates: Sequence[Estimate], weights_hash: str, about: dict[str, object] | None = None
-) -> str:
-    """The text of result.json. about: further entries, such as the files' names."""
-    return estimates_to_json(
-        estimates,
-        weights_hash=weights_hash,
-        versions={name: version(name) for name in ("torch", "numpy", "opencv-python-headless", "moderngl")},
-        about={**(about or {}), "camera": camera_entry(view)},
-    )
 
 
 def _view_of(image: Picture, camera: Camera | str | Path | None) -> View:

@@ -152,14 +152,16 @@ def estimates_to_json(
     weights_hash: str | None = None,
     versions: Mapping[str, str] | None = None,
     about: Mapping[str, Any] | None = None,
+    indent: int | None = 1,
 ) -> str:
     """The result file's text: strict JSON, numbers that are not finite are null.
 
-    versions: of other software, besides posekit's own. about: further entries of the file (image, camera, ...).
+    versions: of other software, besides posekit's own. about: further entries of the file (image, camera, ...). indent:
+    None writes one line.
     """
     origin = {"weights_hash": weights_hash, "versions": {"posekit": __version__, **(versions or {})}}
     entries = [_estimate_to_dict(estimate) | origin for estimate in estimates]
-    return document_to_json(RESULT_SCHEMA, {**(about or {}), "estimates": entries})
+    return document_to_json(RESULT_SCHEMA, {**(about or {}), "estimates": entries}, indent)
 
 
 def document_to_json(schema: str, entries: Mapping[str, Any], indent: int | None = 1) -> str:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -15,24 +14,22 @@ from posekit.cli.options import (
     CameraOption,
     DetectorOption,
     ForceOption,
-    ImageArgument,
+    ImagesArgument,
     JsonOption,
     OutOption,
+    OverlayOption,
+    RayOption,
     ThreadsOption,
     UnitsOption,
+    WorkersOption,
     use_threads,
 )
-
-if TYPE_CHECKING:
-    from posekit.mesh.model import ObjectModel
-    from posekit.results import Detection
-    from posekit.view import View
 
 SCORES = "Detections"
 
 
 def detect(
-    image: ImageArgument,
+    images: ImagesArgument,
     model: Annotated[
         list[Path] | None,
         typer.Option(
@@ -79,39 +76,43 @@ def detect(
     out: OutOption = None,
     force: ForceOption = False,
     json: JsonOption = None,
+    overlay: OverlayOption = True,
+    workers: WorkersOption = 1,
+    ray: RayOption = None,
 ) -> None:
-    """Find objects in a photograph: boxes, masks and scores, as COCO, BOP or posekit JSON."""
-    from posekit.cli.output import Destination
-    from posekit.detect.external import to_bop, to_coco, to_document
-    from posekit.detect.novel import NovelDetector, NovelOptions, make_detector
+    """Find objects in photographs: boxes, masks and scores, as COCO, BOP or posekit JSON."""
+    from posekit.batch.pictures import several
     from posekit.errors import ConfigError
-    from posekit.estimate.instances import SearchOptions
-    from posekit.io.load import load_view
-    from posekit.mesh.model import ObjectModel
-    from posekit.visualise.draw import png
-    from posekit.visualise.figures import detections_overlay
 
     if verify and not model:
         raise ConfigError("--verify looks for poses of meshes: pass --model MESH, or leave it out.")
+
+    from posekit.batch.jobs import Detecting, DetectJob, Meshes, PictureFiles
+
+    job = DetectJob(Meshes(tuple(model or ()), units), camera, detector, min_score, max_detections, verify,
+                    PictureFiles(overlay=overlay))  # fmt: skip
+    if several(images):
+        from posekit.cli.many import Wanted, work_through
+        from posekit.machines import Machines
+
+        work_through(job, images, Wanted(out, force, json, Machines(workers, ray), threads))
+        return
+
+    from posekit.cli.output import Destination
+    from posekit.detect.external import to_bop, to_coco, to_document
+    from posekit.io.load import load_view
+    from posekit.visualise.draw import png
+    from posekit.visualise.figures import detections_overlay
+
+    [image] = images
     destination = Destination.chosen(out, Path("posekit-out") / f"{image.stem}-detections", force, json)
     use_threads(threads)
     view = load_view(image, camera)
-    meshes = [ObjectModel.load(path, units=units) for path in model or ()]
-    finder, classes = make_detector(
-        detector,
-        meshes,
-        min_score=None if verify else min_score,
-        max_detections=max_detections,
-        doubtful=bool(verify),
-    )
-    verify = isinstance(finder, NovelDetector) and bool(meshes) if verify is None else verify
-    if verify and isinstance(finder, NovelDetector):  # the poses are held to the minimum score, not the detections
-        finder = NovelDetector(finder.detector, finder.renderer, NovelOptions(max_detections=max_detections))
+    with destination.working("loading the detector"):
+        detecting = Detecting(job)
     started = time.perf_counter()
-    with destination.working("detecting"):
-        found = sorted(finder.detect(view, meshes), key=lambda d: -d.score)
-    if verify:
-        found = _verified(view, found, meshes, SearchOptions().min_score if min_score is None else min_score)
+    with destination.working("detecting") as tell:
+        found = detecting.found(view, tell)
     seconds = time.perf_counter() - started
     for detection in found:
         destination.say(
@@ -119,24 +120,13 @@ def detect(
             + ",".join(f"{v:.0f}" for v in detection.box)
         )
     if not found:
-        names = ", ".join(m.name for m in meshes) or "an object"
+        names = ", ".join(m.name for m in detecting.meshes) or "an object"
         destination.say(f"{names} not found.")
     destination.say(f"{len(found)} detections in {seconds:.2f} s")
-    folder = destination.folder
+    folder, classes = destination.folder, detecting.classes
     if folder is not None:
-        destination.say(f"overlay: {folder.write('overlay.png', png(detections_overlay(view, found)))}")
+        if overlay:
+            destination.say(f"overlay: {folder.write('overlay.png', png(detections_overlay(view, found)))}")
         destination.say(f"COCO: {folder.write('coco.json', to_coco(found, classes, image, view.camera.size))}")
         destination.say(f"BOP: {folder.write('bop.json', to_bop(found, classes, image, seconds, scene))}")
     destination.write_json(to_document(found, view, image, seconds))
-
-
-def _verified(
-    view: View, found: Sequence[Detection], meshes: Sequence[ObjectModel], min_score: float
-) -> list[Detection]:
-    """The detections that a pose confirms, best first, with the scores of the poses."""
-    from posekit.estimate.estimator import Estimators
-    from posekit.estimate.instances import SearchOptions, find_instances, scored_by_poses
-
-    results = find_instances(Estimators(), view, meshes, found, SearchOptions(min_score=min_score))
-    kept = [d for each in results for d in scored_by_poses(each) if d.score >= min_score]
-    return sorted(kept, key=lambda d: -d.score)

@@ -1,10 +1,9 @@
-"""``posekit estimate``: a photograph and a mesh in, a pose out."""
+"""``posekit estimate``: photographs and meshes in, poses out."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -20,7 +19,7 @@ from posekit.cli.options import (
     ForceOption,
     FormatOption,
     HypothesesOption,
-    ImageArgument,
+    ImagesArgument,
     InitOption,
     IterationsOption,
     JsonOption,
@@ -29,7 +28,9 @@ from posekit.cli.options import (
     MaskOption,
     ModelsOption,
     OutOption,
+    OverlayOption,
     PresetOption,
+    RayOption,
     RequireReliableOption,
     RerunOption,
     StopAngleOption,
@@ -39,10 +40,9 @@ from posekit.cli.options import (
     UnitsOption,
     UpdateOption,
     WeightsOption,
+    WorkersOption,
     use_threads,
 )
-
-CANDIDATES = 3  # detections of a mesh that are estimated at least, of which the best estimate is kept
 
 TopOption = Annotated[
     int,
@@ -73,7 +73,7 @@ MinScoreOption = Annotated[
 
 
 def estimate(
-    image: ImageArgument,
+    images: ImagesArgument,
     model: ModelsOption,
     camera: CameraOption = None,
     box: BoxOption = None,
@@ -103,29 +103,51 @@ def estimate(
     json: JsonOption = None,
     blend: BlendOption = 0.0,
     format_: FormatOption = None,
+    overlay: OverlayOption = True,
     rerun: RerunOption = False,
     require_reliable: RequireReliableOption = False,
+    workers: WorkersOption = 1,
+    ray: RayOption = None,
 ) -> None:
-    """Estimate objects' poses in a photograph, from their meshes. A box, a mask or detections help, but need not be."""
-    from posekit.cli.output import Destination, end_unless_reliable
+    """Estimate objects' poses in photographs, from their meshes. A box, a mask or detections help, but need not be."""
+    from posekit.batch.pictures import several
 
     recording = "estimate.rrd" if rerun else None
+    chosen: dict[str, Any] = {"init": init, "hypotheses": hypotheses, "update": update, "stop": stop,
+                              "iterations": iterations, "stop_angle_deg": stop_angle, "mask_edge": mask_edge,
+                              "colour_edge": colour_edge, "top": top}  # fmt: skip
+    if several(images):
+        from posekit.batch.jobs import EstimateJob, Meshes, NetworkChoice, PictureFiles
+        from posekit.cli.many import Wanted, work_through
+        from posekit.estimate.estimator import EstimateOptions
+        from posekit.machines import Machines
+
+        job = EstimateJob(
+            Meshes(tuple(model), units, symmetry), camera, box, mask, mask_from, detections, detector, instances,
+            min_score, NetworkChoice(preset, weights, device), EstimateOptions(**chosen),
+            PictureFiles(None, overlay, blend, tuple(format_ or ()), recording),
+        )  # fmt: skip
+        work_through(job, images, Wanted(out, force, json, Machines(workers, ray), threads, require_reliable))
+        return
+
+    from posekit.cli.output import Destination, end_unless_reliable
+
+    [image] = images
     destination = Destination.chosen(out, Path("posekit-out") / image.stem, force, json, format_ or (), recording)
 
-    from posekit.cli.meshes import load_meshes
-    from posekit.cli.prompts import prompt_for
+    from posekit.batch.jobs import CANDIDATES, search_for
+    from posekit.batch.meshes import load_meshes
+    from posekit.batch.prompts import prompt_for
     from posekit.estimate.estimator import EstimateOptions, Estimators
-    from posekit.estimate.instances import SearchOptions, find_instances
+    from posekit.estimate.instances import find_instances
     from posekit.io.load import load_view
 
     use_threads(threads)
-    options = EstimateOptions(
-        init, hypotheses, update, stop, iterations, stop_angle, mask_edge=mask_edge, colour_edge=colour_edge, top=top
-    )
+    options = EstimateOptions(**chosen)
     view = load_view(image, camera)
     meshes = load_meshes(model, units, symmetry)
     finder = prompt_for(box, mask, mask_from, detections, image, view.lens)
-    asked = finder is not None
+    prompted = finder is not None
     if finder is None:
         from posekit.detect.novel import make_detector
 
@@ -136,15 +158,11 @@ def estimate(
         found = finder.detect(view, meshes)
     with destination.working("loading the networks"):
         estimators = Estimators(preset=preset, weights=weights, options=options, device=device)
-    search = SearchOptions.usual(found)
-    search = replace(search, candidates=max(search.candidates, instances + 1),
-                     instances=search.instances if asked else instances,
-                     min_score=search.min_score if min_score is None else min_score)  # fmt: skip
-    with destination.working("estimating"):
-        results = find_instances(estimators, view, meshes, found, search)
+    with destination.working("estimating") as estimators.tell:
+        results = find_instances(estimators, view, meshes, found, search_for(found, prompted, instances, min_score))
     paths = [{"image": image, "mesh": path} for path in model]
     destination.deliver_all(
-        view, [(estimators(each.model), each.instances) for each in results], paths, blend, symmetry
+        view, [(estimators(each.model), each.instances) for each in results], paths, blend, symmetry, overlay
     )
     if require_reliable:
         end_unless_reliable([each for found_of in results for each in found_of.instances])

@@ -214,7 +214,7 @@ def evaluate(
     )
     name = dataset or (root.resolve().name if root is not None else "data")
     folder = out or Path("posekit-out") / f"eval-{name}-{stage}"
-    with progress_bar("count", "remaining") as update_bar:
+    with progress_bar("count", "remaining", stage="evaluating") as update_bar:
         outcome = run(
             options, folder, command=_command(), csv=csv, force=force, with_vsd=vsd,
             progress=lambda done, every: update_bar(completed=done, total=every),

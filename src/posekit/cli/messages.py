@@ -7,12 +7,14 @@ import logging
 import os
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
+
+from posekit.cli.plain_lines import plain_lines
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -66,21 +68,36 @@ def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
     tell("warning", str(message), typer.colors.YELLOW)
 
 
+def wanted() -> bool:
+    """Whether notes and progress are: not with --quiet."""
+    return log.isEnabledFor(logging.INFO)
+
+
 def progress_console() -> Console:
     """Where progress is shown: standard error. It prints nothing where that is no terminal, or with --quiet."""
     from rich.console import Console
 
     console = Console(stderr=True)
-    console.quiet = not console.is_terminal or not log.isEnabledFor(logging.INFO)
+    console.quiet = not console.is_terminal or not wanted()
     return console
 
 
+Tell = Callable[[str], None]
+
+
 @contextmanager
-def working(what: str) -> Iterator[None]:
-    """Show what is being done, on a terminal, and log how long it took."""
-    started = time.perf_counter()
-    with progress_console().status(f"{what} ..."):
-        yield
+def working(what: str) -> Iterator[Tell]:
+    """Show what is being done, and log how long it took: a status line on a terminal, else plain lines of what takes
+    its time. Gives a function that takes a more exact text."""
+    started, console = time.perf_counter(), progress_console()
+    with console.status(f"{what} ...") as status, plain_lines(wanted() and not console.is_terminal) as lines:
+
+        def tell(text: str) -> None:
+            status.update(f"{text} ...")
+            lines.update(text)
+
+        tell(what)
+        yield tell
     log.debug("%s: %.2f s", what, time.perf_counter() - started)
 
 

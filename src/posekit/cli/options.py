@@ -18,7 +18,14 @@ INPUT, LOOP, OUTPUT = "Input", "Refinement", "Output"
 SOURCES, SCHEDULE, MACHINE = "Sources", "Schedule", "Machine"  # of trainings
 NOT_RELIABLE = 3  # exit code of --require-reliable
 
-ImageArgument = Annotated[Path, typer.Argument(metavar="IMAGE", help="The photograph.", show_default=False)]
+ImagesArgument = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="IMAGE",
+        help="The photograph, or several: files, a folder of pictures or a glob.",
+        show_default=False,
+    ),
+]
 ModelOption = Annotated[
     Path,
     typer.Option(
@@ -221,6 +228,14 @@ RequireReliableOption = Annotated[
         rich_help_panel=OUTPUT,
     ),
 ]
+OverlayOption = Annotated[
+    bool,
+    typer.Option(
+        "--overlay/--no-overlay",
+        help="Draw what was found into the photograph: overlay.png.",
+        rich_help_panel=OUTPUT,
+    ),
+]
 RerunOption = Annotated[
     bool,
     typer.Option(
@@ -233,8 +248,8 @@ OutOption = Annotated[
     Path | None,
     typer.Option(
         metavar="DIR",
-        help="Folder for the results, new or empty. Default: a folder in posekit-out, or in posekit-out-2 and so on "
-        "where that holds results; none if --json is given.",
+        help="Folder for the results, new or empty; of several pictures also one to go on with. Default: a folder in "
+        "posekit-out, or in posekit-out-2 and so on where that holds results; none if --json is given.",
         rich_help_panel=OUTPUT,
     ),
 ]
@@ -253,6 +268,23 @@ JsonOption = Annotated[
         help="Write the result as JSON to FILE. With - it goes to standard output, and everything else to standard "
         "error.",
         rich_help_panel=OUTPUT,
+    ),
+]
+
+WorkersOption = Annotated[
+    int,
+    typer.Option(
+        min=1, metavar="N", help="Number of processes that share the pictures, where there are several.",
+        rich_help_panel=MACHINE,
+    ),
+]  # fmt: skip
+RayOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS|local",
+        help="Share the pictures over a Ray cluster whose machines see the same files; local: one on this machine, "
+        "with --workers processes.",
+        rich_help_panel=MACHINE,
     ),
 ]
 
@@ -284,7 +316,10 @@ ConfigFileOption = Annotated[
     Path | None,
     typer.Option("--config", metavar="TOML", help="File with all settings; options given here override it."),
 ]
-MinutesOption = Annotated[float | None, typer.Option(help="Stop after so many minutes.", rich_help_panel=SCHEDULE)]
+MinutesOption = Annotated[
+    float | None,
+    typer.Option(help="End within so many minutes, the last validation and export included.", rich_help_panel=SCHEDULE),
+]
 StepsOption = Annotated[int | None, typer.Option(help="Stop after so many optimiser steps.", rich_help_panel=SCHEDULE)]
 RateOption = Annotated[float | None, typer.Option(help="Highest learning rate.", rich_help_panel=SCHEDULE)]
 TrainingSeedOption = Annotated[

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from posekit.cli.messages import working
+from posekit.cli.messages import Tell, working
 from posekit.cli.options import NOT_RELIABLE
 from posekit.errors import OutputError
 from posekit.geometry import rotation_angle
@@ -146,10 +146,10 @@ class Destination:
         typer.echo(text, err=self.json == "-")
 
     @contextmanager
-    def working(self, what: str) -> Iterator[None]:
-        """Show what is being done, on a terminal only."""
-        with working(what):
-            yield
+    def working(self, what: str) -> Iterator[Tell]:
+        """As `posekit.cli.messages.working`."""
+        with working(what) as tell:
+            yield tell
 
     def deliver(
         self,
@@ -159,9 +159,10 @@ class Destination:
         files: Mapping[str, Path],
         blend: float = 0.0,
         symmetry: str | None = "none",
+        overlay: bool = True,
     ) -> None:
         """`deliver_all` of one mesh. files: what they were made from, by name, for the result."""
-        self.deliver_all(view, [(estimator, estimates)], [files], blend, symmetry)
+        self.deliver_all(view, [(estimator, estimates)], [files], blend, symmetry, overlay)
 
     def deliver_all(
         self,
@@ -170,10 +171,12 @@ class Destination:
         files: Sequence[Mapping[str, Path]],
         blend: float = 0.0,
         symmetry: str | None = "none",
+        overlay: bool = True,
     ) -> None:
-        """Print the estimates and write them: one result as JSON, and one overlay. files: by mesh. blend: how much of
-        the rendered meshes the overlay shows. symmetry: what was said of the meshes, None where nothing was."""
-        from posekit.api import result_json
+        """Print the estimates and write them: one result as JSON, and one overlay where that is wanted. files: by mesh.
+        blend: how much of the rendered meshes the overlay shows. symmetry: what was said of the meshes, None where
+        nothing was."""
+        from posekit.estimate.document import result_json
 
         for (estimator, estimates), made_from in zip(results, files, strict=True):
             for estimate in estimates:
@@ -189,7 +192,8 @@ class Destination:
         found = [estimate for _, estimates in results for estimate in estimates]
         result = result_json(view, found, results[0][0].weights_hash, about)
         if self.folder is not None:
-            self.say(f"overlay: {self.folder.write('overlay.png', _overlay(view, results, blend))}")
+            if overlay:
+                self.say(f"overlay: {self.folder.write('overlay.png', _overlay(view, results, blend))}")
             self.say(f"result: {self.folder.write('result.json', result)}")
             for format_ in dict.fromkeys(self.formats):
                 for name, text in pose_files(format_, [named_pose(each) for each in found]).items():

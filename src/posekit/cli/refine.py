@@ -1,9 +1,9 @@
-"""``posekit refine``: a known pose made better."""
+"""``posekit refine``: known poses made better."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -16,7 +16,7 @@ from posekit.cli.options import (
     DeviceOption,
     ForceOption,
     FormatOption,
-    ImageArgument,
+    ImagesArgument,
     IterationsOption,
     JsonOption,
     MaskEdgeOption,
@@ -24,8 +24,10 @@ from posekit.cli.options import (
     MaskOption,
     ModelOption,
     OutOption,
+    OverlayOption,
     PerturbOption,
     PresetOption,
+    RayOption,
     RequireReliableOption,
     RerunOption,
     StopAngleOption,
@@ -35,21 +37,23 @@ from posekit.cli.options import (
     UnitsOption,
     UpdateOption,
     WeightsOption,
+    WorkersOption,
     use_threads,
 )
 
 PoseOption = Annotated[
     Path,
     typer.Option(
-        metavar="FILE",
-        help="A result of estimate, JSON with T_cam_obj (4x4, metres), or text: a 4x4 matrix, or x y z qx qy qz qw.",
+        metavar="FILE|FOLDER",
+        help="A result of estimate, JSON with T_cam_obj (4x4, metres), or text: a 4x4 matrix, or x y z qx qy qz qw. Of "
+        "several pictures: results.jsonl of estimate, or a folder with NAME/result.json, NAME.json or NAME.txt.",
         rich_help_panel=INPUT,
     ),
 ]
 
 
 def refine(
-    image: ImageArgument,
+    images: ImagesArgument,
     model: ModelOption,
     pose: PoseOption,
     camera: CameraOption = None,
@@ -74,31 +78,47 @@ def refine(
     json: JsonOption = None,
     blend: BlendOption = 0.0,
     format_: FormatOption = None,
+    overlay: OverlayOption = True,
     rerun: RerunOption = False,
     require_reliable: RequireReliableOption = False,
+    workers: WorkersOption = 1,
+    ray: RayOption = None,
 ) -> None:
-    """Refine a pose that is roughly known; a mask or a box helps, but neither is needed."""
+    """Refine poses that are roughly known; a mask or a box helps, but neither is needed."""
+    from posekit.batch.pictures import several
+
+    recording = "refine.rrd" if rerun else None
+    chosen: dict[str, Any] = {"update": update, "stop": stop, "iterations": iterations, "stop_angle_deg": stop_angle,
+                              "perturb": perturb, "mask_edge": mask_edge, "colour_edge": colour_edge}  # fmt: skip
+    if several(images):
+        from posekit.batch.jobs import Meshes, NetworkChoice, PictureFiles, RefineJob
+        from posekit.cli.many import Wanted, work_through
+        from posekit.estimate.estimator import EstimateOptions
+        from posekit.machines import Machines
+
+        job = RefineJob(
+            Meshes((model,), units, symmetry), pose, camera, box, mask, mask_from,
+            NetworkChoice(preset, weights, device), EstimateOptions(**chosen),
+            PictureFiles(None, overlay, blend, tuple(format_ or ()), recording),
+        )  # fmt: skip
+        work_through(job, images, Wanted(out, force, json, Machines(workers, ray), threads, require_reliable))
+        return
+
     from posekit.cli.output import Destination, end_unless_reliable
 
-    default, recording = Path("posekit-out") / f"{image.stem}-refined", "refine.rrd" if rerun else None
+    [image] = images
+    default = Path("posekit-out") / f"{image.stem}-refined"
     destination = Destination.chosen(out, default, force, json, format_ or (), recording)
 
-    from posekit.cli.meshes import load_meshes
-    from posekit.cli.prompts import detector_for
+    from posekit.batch.meshes import load_meshes
+    from posekit.batch.prompts import detector_for
+    from posekit.batch.start_poses import StartPoses
     from posekit.estimate.estimator import EstimateOptions, PoseEstimator
-    from posekit.io.load import load_pose, load_view
+    from posekit.io.load import load_view
 
     use_threads(threads)
-    options = EstimateOptions(
-        update=update,
-        stop=stop,
-        iterations=iterations,
-        stop_angle_deg=stop_angle,
-        perturb=perturb,
-        mask_edge=mask_edge,
-        colour_edge=colour_edge,
-    )
-    start = load_pose(pose)
+    options = EstimateOptions(**chosen)
+    start = StartPoses(pose).first(image, model.stem)
     view = load_view(image, camera)
     [mesh] = load_meshes([model], units, symmetry)
     if box is not None or mask is not None:
@@ -106,8 +126,8 @@ def refine(
         view = view.with_mask(detection.mask)
     with destination.working("loading the networks"):
         estimator = PoseEstimator(mesh, preset=preset, weights=weights, options=options, device=device)
-    with destination.working("refining"):
+    with destination.working("refining") as estimator.tell:
         refined = estimator.refine(view, start)
-    destination.deliver(estimator, view, [refined], {"image": image, "mesh": model}, blend, symmetry)
+    destination.deliver(estimator, view, [refined], {"image": image, "mesh": model}, blend, symmetry, overlay)
     if require_reliable:
         end_unless_reliable([refined])

@@ -110,8 +110,9 @@ def synth(
     ] = False,
 ) -> None:
     """Make a data set of your meshes: images, depth, masks and poses in BOP layout."""
+    from posekit.machines import Machines
     from posekit.synth.plan import SynthConfig
-    from posekit.synth.run import Machines, begin, run
+    from posekit.synth.run import begin, run
 
     machines, given = Machines(workers, ray), [*(models or ()), *(more or ())]
     if resume and given:
@@ -130,7 +131,7 @@ def synth(
             samples, variant, motion,
         )  # fmt: skip
         begin(config, out, objects)
-    with progress_bar("count", "elapsed", "remaining") as update:
+    with progress_bar("count", "elapsed", "remaining", stage="making images") as update:
         made = run(out, machines, lambda done, total: update(completed=done, total=total), shards)
     typer.echo(f"{made} images made; data set: {out}")
     typer.echo(f"contact sheet: {out / 'contact_sheet.jpg'}\nstatistics: {out / 'statistics.json'}")

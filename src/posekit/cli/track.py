@@ -113,7 +113,7 @@ def track(
     require_reliable: RequireReliableOption = False,
 ) -> None:
     """Follow objects through a video: poses as they come, and an overlay to look at."""
-    from posekit.cli.meshes import load_meshes
+    from posekit.batch.meshes import load_meshes
     from posekit.cli.output import Destination
     from posekit.errors import ImageError, PromptError
     from posekit.io.pose_formats import pose_files
@@ -345,7 +345,7 @@ def _recorder(path: Path, trackers: Sequence[Tracker]) -> Iterator[Any]:
 @contextmanager
 def _bar(sequence: Frames) -> Iterator[Any]:
     """Frames a second, angle and state, live on a terminal."""
-    with progress_bar("count", "text", total=sequence.count) as update:
+    with progress_bar("count", "text", total=sequence.count, stage="tracking") as update:
         mean = 0.0
 
         def show(seconds: float, results: Sequence[Tracked]) -> None:

@@ -232,7 +232,7 @@ def _bar() -> Iterator[Show]:
         def show(progress: Any) -> None:
             loss = progress.values.get("loss", float("nan"))
             told = progress.label or f"step {progress.step}, loss {loss:.3f}"
-            update(completed=progress.done, description=told)
+            update(stage=progress.label or "training", completed=progress.done, description=told)
 
         yield show
 

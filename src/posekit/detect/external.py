@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -43,30 +44,8 @@ class DetectionsFile:
 
     @classmethod
     def read(cls, path: Path, image: Path) -> DetectionsFile:
-        """The entries for a photograph: its number is the last one in its name, as BOP has it; a file about one picture
-        only is taken to be about this one. Of several scenes the one of the picture's folder counts.
-
-        Entries that cannot be used are skipped and logged. Raises PromptError where the file is no detections, or has
-        none for this picture, and says which pictures it has.
-        """
-        try:
-            text = read_text(path)
-            data = json_lines(text) or json.loads(text)
-        except (OSError, ValueError, RecursionError) as error:
-            raise PromptError(f"the detections {path} cannot be read ({error}): give {_FORMS}.") from error
-        check_schema(data, str(path))
-        own = isinstance(data, dict) and data.get("schema") == DETECTIONS_SCHEMA
-        try:
-            every, names, files = _parts(_as_coco(data) if own and isinstance(data, dict) else data)
-            entries = [e for k, e in enumerate(every) if _usable(e, k, path.name)]
-        except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
-            raise PromptError(f"{path} holds no detections ({error!r}): give {_FORMS}.") from error
-        if every and not entries:
-            raise PromptError(f"{path} has {len(every)} entries and none that can be used: give {_FORMS}.")
-        if not every:
-            log.warning("%s holds no detections at all.", path.name)
-        here = _of_picture(_of_scene(entries, image, path.name), image, files, path.name)
-        return cls(here, names, path.name, own)
+        """The entries for a photograph: `Detections.read`, and its ``of``."""
+        return Detections.read(path).of(image)
 
     def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
         """Each model's detections by falling score. A category belongs to the model of its name, or of its number
@@ -137,8 +116,100 @@ class DetectionsFile:
         return Detection(clip_box(box, view.camera), mask, score, model.name, Source.FILE)
 
 
+@dataclass(frozen=True, eq=False)
+class Detections:
+    """A file with the detections of one picture or of many, read once. files: names of pictures, by number. The rest is
+    as `DetectionsFile` has it."""
+
+    entries: Sequence[Mapping[str, Any]]
+    names: Mapping[int, str]
+    files: Mapping[int, str]
+    label: str
+    undistorted: bool = False
+
+    @classmethod
+    def read(cls, path: Path) -> Detections:
+        """Entries that cannot be used are skipped and logged. Raises PromptError where the file is no detections."""
+        try:
+            text = read_text(path)
+            data = json_lines(text) or json.loads(text)
+        except (OSError, ValueError, RecursionError) as error:
+            raise PromptError(f"the detections {path} cannot be read ({error}): give {_FORMS}.") from error
+        try:
+            documents = _documents(data)
+            for document in data if isinstance(data, list) else [data]:
+                check_schema(document, str(path))
+            every, names, files = _parts(_as_coco(documents) if documents else data)
+            entries = [e for k, e in enumerate(every) if _usable(e, k, path.name)]
+        except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
+            raise PromptError(f"{path} holds no detections ({error!r}): give {_FORMS}.") from error
+        if every and not entries:
+            raise PromptError(f"{path} has {len(every)} entries and none that can be used: give {_FORMS}.")
+        if not every:
+            log.warning("%s holds no detections at all.", path.name)
+        return cls(entries, names, files, path.name, bool(documents))
+
+    def of(self, image: Path) -> DetectionsFile:
+        """The entries for a photograph: its number is the last one in its name, as BOP has it; a file about one picture
+        only is taken to be about this one. Of several scenes the one of the picture's folder counts. Raises PromptError
+        where there are none for this picture, and says which pictures there are."""
+        pictures = self._pictures[self._scene(image)]
+        own = self._number(image)
+        if own not in pictures and len(pictures) <= 1 and (own is None or own not in self.files):
+            found = [entry for entries in pictures.values() for entry in entries]
+        else:
+            found = [] if own is None else pictures.get(own, [])
+        if not found and pictures and own not in self.files:
+            which = "a picture without a number in its name" if own is None else f"image {own}"
+            raise PromptError(
+                f"{self.label} has nothing for {image.name} ({which}); it is about the images {_some(set(pictures))}. "
+                "Name the picture by its number, or keep its entries alone."
+            )
+        return DetectionsFile(found, self.names, self.label, self.undistorted)
+
+    @cached_property
+    def _pictures(self) -> dict[int | None, dict[int, list[Mapping[str, Any]]]]:
+        """By scene, where there are several (else None), the entries of each picture."""
+        scenes = {int(e["scene_id"]) for e in self.entries if e.get("scene_id") is not None}
+        several = scenes if len(scenes) > 1 else {None}
+        found: dict[int | None, dict[int, list[Mapping[str, Any]]]] = {scene: {} for scene in several}
+        for entry in self.entries:
+            stated = entry.get("scene_id")
+            for scene in several if stated is None or len(scenes) < 2 else [int(stated)]:
+                found[scene].setdefault(int(entry["image_id"]), []).append(entry)
+        return found
+
+    def _scene(self, image: Path) -> int | None:
+        """Of several scenes the one that the picture's folder is named after. Raises PromptError."""
+        scenes = {scene for scene in self._pictures if scene is not None}
+        if not scenes:
+            return None
+        own = next((int(p.name) for p in image.resolve().parents if p.name.isascii() and p.name.isdigit()), None)
+        if own not in scenes:
+            where = (
+                "the picture lies in no folder of a scene's number" if own is None else f"the picture is of scene {own}"
+            )
+            raise PromptError(
+                f"{self.label} is about the scenes {_some(scenes)}, and {where}: keep the entries of its scene."
+            )
+        return own
+
+    @cached_property
+    def _numbers(self) -> dict[str, int]:
+        """Of pictures that have a name, by path and by name, of several with a name the first."""
+        found: dict[str, int] = {}
+        for number, name in self.files.items():
+            found.setdefault(Path(name).name, number)
+        return found | {name: number for number, name in self.files.items()}
+
+    def _number(self, image: Path) -> int | None:
+        named = self._numbers.get(str(image), self._numbers.get(image.name))
+        return named if named is not None else _last_number(image)
+
+
 def json_lines(text: str) -> list[Any] | None:
-    """The entries of a file that has one detection a line (JSON Lines); None where it has another form."""
+    """The entries of a file that has one detection, or one picture's `to_document`, a line (JSON Lines); None where it
+    has another form."""
     lines = [line for line in text.split("\n") if line.strip()]
     if not lines or not all(line.lstrip().startswith("{") for line in lines):
         return None
@@ -146,7 +217,8 @@ def json_lines(text: str) -> list[Any] | None:
         found = [json.loads(line) for line in lines]
     except ValueError:
         return None
-    return found if all("category_id" in entry for entry in found) else None
+    known = all("category_id" in entry or entry.get("schema") == DETECTIONS_SCHEMA for entry in found)
+    return found if known else None
 
 
 def _parts(data: Any) -> tuple[list[Any], dict[int, str], dict[int, str]]:
@@ -160,21 +232,29 @@ def _parts(data: Any) -> tuple[list[Any], dict[int, str], dict[int, str]]:
     return list(data["annotations"]), names, files
 
 
-def _as_coco(data: Mapping[str, Any]) -> dict[str, Any]:
-    """A document of `to_document` as COCO has it."""
-    labels = {name: k for k, name in enumerate(sorted({str(d["label"] or "") for d in data["detections"]}))}
+def _documents(data: Any) -> list[Mapping[str, Any]]:
+    """The documents of `to_document` in a file, none where it has another form."""
+    found = data if isinstance(data, list) else [data]
+    own = bool(found) and all(isinstance(d, Mapping) and d.get("schema") == DETECTIONS_SCHEMA for d in found)
+    return list(found) if own else []
+
+
+def _as_coco(documents: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Documents of `to_document` as COCO has it."""
+    labels = sorted({str(d["label"] or "") for document in documents for d in document["detections"]})
     return {
-        "images": [{"id": 0, "file_name": data.get("image", "")}],
-        "categories": [{"id": k, "name": name} for name, k in labels.items()],
+        "images": [{"id": n, "file_name": document.get("image", "")} for n, document in enumerate(documents)],
+        "categories": [{"id": k, "name": name} for k, name in enumerate(labels)],
         "annotations": [
             {
-                "image_id": 0,
-                "category_id": labels[str(d["label"] or "")],
+                "image_id": n,
+                "category_id": labels.index(str(d["label"] or "")),
                 "score": d["score"],
                 "bbox": xywh(tuple(d["box"])),
                 "segmentation": d["mask"],
             }
-            for d in data["detections"]
+            for n, document in enumerate(documents)
+            for d in document["detections"]
         ],
     }
 
@@ -192,44 +272,13 @@ def _usable(entry: Any, k: int, label: str) -> bool:
     return True
 
 
-def _of_scene(entries: list[Mapping[str, Any]], image: Path, label: str) -> list[Mapping[str, Any]]:
-    """Of several scenes, the entries of the one that the picture's folder is named after. Raises PromptError."""
-    scenes = {int(e["scene_id"]) for e in entries if e.get("scene_id") is not None}
-    own = next((int(p.name) for p in image.resolve().parents if p.name.isascii() and p.name.isdigit()), None)
-    if len(scenes) < 2:
-        return entries
-    if own not in scenes:
-        where = "the picture lies in no folder of a scene's number" if own is None else f"the picture is of scene {own}"
-        raise PromptError(f"{label} is about the scenes {_some(scenes)}, and {where}: keep the entries of its scene.")
-    return [e for e in entries if e.get("scene_id") is None or int(e["scene_id"]) == own]
-
-
-def _of_picture(
-    entries: list[Mapping[str, Any]], image: Path, files: Mapping[int, str], label: str
-) -> list[Mapping[str, Any]]:
-    """The entries of a picture. Raises PromptError where several others have some and this one none."""
-    pictures = {int(e["image_id"]) for e in entries}
-    own = _image_number(image, files)
-    if own not in pictures and len(pictures) <= 1 and (own is None or own not in files):
-        return entries
-    found = [e for e in entries if int(e["image_id"]) == own]
-    if not found and own not in files:
-        which = "a picture without a number in its name" if own is None else f"image {own}"
-        raise PromptError(
-            f"{label} has nothing for {image.name} ({which}); it is about the images {_some(pictures)}. Name the "
-            "picture by its number, or keep its entries alone."
-        )
-    return found
-
-
 def _some(numbers: set[int]) -> str:
     return ", ".join(map(str, sorted(numbers)[:8])) + (", ..." if len(numbers) > 8 else "")
 
 
-def _image_number(image: Path, files: Mapping[int, str]) -> int | None:
-    named = next((number for number, name in files.items() if Path(name).name == image.name), None)
+def _last_number(image: Path) -> int | None:
     digits = re.findall(r"\d+", image.stem)
-    return named if named is not None else int(digits[-1]) if digits else None
+    return int(digits[-1]) if digits else None
 
 
 def model_number(name: str) -> int | None:
@@ -278,7 +327,7 @@ def to_coco(detections: Sequence[Detection], names: Sequence[str], image: Path, 
     """COCO's {images, annotations, categories}, annotations with scores. names: of all classes. size: (width,
     height)."""
     numbers = categories_of(names)
-    number = _image_number(image, {}) or 0
+    number = _last_number(image) or 0
     document = {
         "images": [{"id": number, "file_name": image.name, "width": size[0], "height": size[1]}],
         "categories": [{"id": number, "name": name} for name, number in numbers.items()],
@@ -299,13 +348,16 @@ def to_bop(
     if scene is None:
         folder = image.resolve().parent.parent.name
         scene = int(folder) if folder.isdigit() else 0
-    number = _image_number(image, {}) or 0
+    number = _last_number(image) or 0
     entries = [{"scene_id": scene, **_entry(d, number, numbers), "time": seconds} for d in detections]
     return json.dumps(entries, indent=1, allow_nan=False) + "\n"
 
 
-def to_document(detections: Sequence[Detection], view: View, image: Path, seconds: float) -> str:
-    """posekit's own form (docs/result-json.md), best first. seconds: of the whole picture."""
+def to_document(
+    detections: Sequence[Detection], view: View, image: Path, seconds: float, indent: int | None = 1
+) -> str:
+    """posekit's own form (docs/result-json.md), best first. seconds: of the whole picture. indent: None writes one
+    line."""
     entries = [
         {
             "box": list(d.box),
@@ -317,7 +369,7 @@ def to_document(detections: Sequence[Detection], view: View, image: Path, second
         for d in sorted(detections, key=lambda d: -d.score)
     ]
     about = {"image": image, "camera": camera_entry(view), "seconds": seconds, "detections": entries}
-    return document_to_json(DETECTIONS_SCHEMA, about)
+    return document_to_json(DETECTIONS_SCHEMA, about, indent)
 
 
 def _entry(detection: Detection, image: int, numbers: Mapping[str, int]) -> dict[str, Any]:

@@ -73,6 +73,11 @@ class NovelOptions:
             )
 
 
+TO_VERIFY = NovelOptions(
+    max_detections=SCREENED, min_score=LEAST_SIMILARITY, sharpen=False
+)  # for poses to choose among
+
+
 @dataclass(frozen=True, eq=False)
 class _Appearance:
     """Of pictures. features: (N, C), each level's of unit length. chroma: (N, 2)."""
@@ -320,7 +325,7 @@ def make_detector(
         else NovelOptions(min_score=min_score, min_proposal_score=min_score, max_detections=max_detections)
     )
     if doubtful and models and min_score is None:  # poses choose among many
-        options = NovelOptions(max_detections=SCREENED, min_score=LEAST_SIMILARITY, sharpen=False)
+        options = TO_VERIFY
     elif models and min_score is not None:
         options = NovelOptions(min_score=min_score, max_detections=max_detections)
     return NovelDetector(trained, Renderer(), options), tuple(m.name for m in models) or trained.config.classes

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -80,14 +80,21 @@ class EstimateOptions:
         return RefineOptions(update, self.stop, self.iterations, stop_angle, colour_edge=self.colour_edge)
 
 
+Tell = Callable[[str], None]
+
+
+def _tell_nobody(stage: str) -> None:
+    """Where nobody watches."""
+
+
 class PoseEstimator:
     """Estimates the pose of one object in photographs.
 
     networks: those of a training, or what several estimators share (see `Estimators`), in place of those that preset
     and weights name. device: of the networks: "auto" (a GPU where there is one), "cpu" or "cuda". runtime: what runs
     them: "openvino", "torch" or "auto", see `Runtime`.
-    Not thread-safe: one estimator per thread. Raises WeightsError where the preset has no weights, ConfigError where
-    there is no such device.
+    ``tell`` may be set to a function that is told what is being done. Not thread-safe: one estimator per thread. Raises
+    WeightsError where the preset has no weights, ConfigError where there is no such device.
     """
 
     def __init__(
@@ -102,6 +109,7 @@ class PoseEstimator:
         runtime: str = "auto",
     ) -> None:
         self.model, self.options = model, options
+        self.tell: Tell = _tell_nobody
         if not isinstance(networks, Runtime):
             networks = Runtime(preset, weights, device=device, runtime=runtime, networks=networks)
         self.runtime = networks
@@ -139,6 +147,7 @@ class PoseEstimator:
         estimates = []
         for detection in detections:
             started = time.perf_counter()
+            self.tell(f"looking for first poses of {self.model.name}")
             first = self.first_poses(view, detection)
             searched = time.perf_counter()
             log.debug(
@@ -208,8 +217,12 @@ class PoseEstimator:
         return self._finals(view, scorer, candidates)
 
     def _candidates(self, view: View, starts: Sequence[Pose], iterations: int = PRUNING_ITERATIONS) -> list[Refinement]:
+        self._tell_refining(len(starts))
         short = replace(self.refine_options, iterations=iterations)
         return refine(view, self.model, starts, self.predictor, self.renderer, short)
+
+    def _tell_refining(self, count: int) -> None:
+        self.tell(f"refining {self.model.name}: {count} {'hypothesis' if count == 1 else 'hypotheses'}")
 
     def _finals(self, view: View, scorer: EvidenceScorer, candidates: Sequence[Refinement]) -> list[Refinement]:
         """The best go on to the end."""
@@ -232,6 +245,7 @@ class PoseEstimator:
         options = replace(self.refine_options, iterations=iterations)
         there = [candidate.converged and options.stop == "angle" for candidate in candidates]
         poses = [candidate.T_cam_obj for candidate, done in zip(candidates, there, strict=True) if not done]
+        self._tell_refining(len(poses))
         ends = iter(refine(view, self.model, poses, self.predictor, self.renderer, options))
         return [
             candidate if done else candidate.then(next(ends), options.stop)
@@ -346,11 +360,13 @@ class Estimators:
         runtime: str = "auto",
     ) -> None:
         self.runtime, self.options = Runtime(preset, weights, device=device, runtime=runtime), options
+        self.tell: Tell = _tell_nobody  # of all of them
         self._made: dict[ObjectModel, PoseEstimator] = {}
 
     def __call__(self, model: ObjectModel) -> PoseEstimator:
         if model not in self._made:
             self._made[model] = PoseEstimator(model, options=self.options, networks=self.runtime)
+        self._made[model].tell = self.tell
         return self._made[model]
 
 

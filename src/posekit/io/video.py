@@ -6,7 +6,7 @@ import glob
 import json
 import logging
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
@@ -81,13 +81,13 @@ def open_frames(source: str, camera: str | Path | None = None) -> Frames:
     if path.is_dir():
         if cameras := sorted(path.glob("scene_camera*.json")):
             return SceneFrames(_only(cameras))
-        return PictureFrames(_pictures(path.iterdir(), source), camera)
+        return PictureFrames(pictures_in(path.iterdir(), source), camera)
     if path.is_file() and re.fullmatch(r"scene_camera(_.+)?\.json", path.name):
         return SceneFrames(path)
     if path.is_file():
         return PictureFrames([path], camera) if path.suffix.lower() in PICTURES else VideoFrames(path, camera)
     if glob.has_magic(source):
-        return PictureFrames(_pictures(map(Path, glob.glob(source)), source), camera)  # noqa: PTH207 - absolute globs
+        return PictureFrames(pictures_in(map(Path, glob.glob(source)), source), camera)  # noqa: PTH207 - absolute globs
     raise InputError(
         f"there is no {source}: give a video, a folder or glob of pictures, a BOP scene, or a camera's number."
     )
@@ -104,9 +104,9 @@ def open_uncalibrated(source: str) -> PictureFrames | VideoFrames:
     if path.is_file():
         return PictureFrames([path], NO_CAMERA)
     if path.is_dir():
-        return PictureFrames(_pictures(path.iterdir(), source), NO_CAMERA)
+        return PictureFrames(pictures_in(path.iterdir(), source), NO_CAMERA)
     if glob.has_magic(source):
-        return PictureFrames(_pictures(map(Path, glob.glob(source)), source), NO_CAMERA)  # noqa: PTH207
+        return PictureFrames(pictures_in(map(Path, glob.glob(source)), source), NO_CAMERA)  # noqa: PTH207
     raise InputError(f"there is no {source}: give pictures, a folder or glob of them, or a video.")
 
 
@@ -121,7 +121,9 @@ def _only(cameras: list[Path]) -> Path:
     return (plain or cameras)[0]
 
 
-def _pictures(paths: Any, source: str) -> list[Path]:
+def pictures_in(paths: Iterable[Path], source: str) -> list[Path]:
+    """The pictures among paths, by their suffix, hidden ones left out, in the order of the numbers in their names.
+    Raises InputError where there is none. source: what has them, for the message."""
     shown = (path for path in paths if path.suffix.lower() in PICTURES and not path.name.startswith("."))
     found = sorted(shown, key=_natural)
     if not found:

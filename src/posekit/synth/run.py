@@ -8,23 +8,16 @@ from __future__ import annotations
 
 import itertools
 import json
-import logging
-import multiprocessing
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-import cv2
-
 from posekit.datasets.bop_writer import BopWriter, write_models
 from posekit.datasets.registry import NAMES, own_names
-from posekit.errors import ConfigError, OutputError, PosekitError
+from posekit.errors import ConfigError, OutputError
 from posekit.io.files import check_writable, write_text_atomic
+from posekit.machines import Machines, in_order
 from posekit.mesh.model import ObjectModel
 from posekit.render import Renderer
 from posekit.synth.plan import CONFIG, Maker, SynthConfig
@@ -34,18 +27,6 @@ from posekit.synth.shards import write_shards
 CHUNK = 8  # images that a process is given at a time, where they are made one by one
 
 Show = Callable[[int, int], None]
-
-
-@dataclass(frozen=True)
-class Machines:
-    """workers: processes. ray: a Ray cluster's address, "local" for one on this machine; None = no Ray."""
-
-    workers: int = 1
-    ray: str | None = None
-
-    def __post_init__(self) -> None:
-        if self.workers < 1:
-            raise ConfigError(f"{self.workers} workers: at least 1 is needed.")
 
 
 def check_new(root: Path) -> None:
@@ -99,11 +80,9 @@ def run(root: Path, machines: Machines, show: Show, shard: int = 0) -> int:
 def _work(config: SynthConfig, root: Path, missing: Sequence[int], machines: Machines) -> Iterator[int]:
     """Make images; yields how many were made, again and again."""
     jobs = list(_jobs(config, missing))
-    if machines.ray is not None:
-        return _on_ray(machines, root, jobs)
-    if machines.workers == 1 or len(jobs) < 2:
-        return (make_images(str(root), job) for job in jobs)
-    return _in_processes(machines, root, jobs)
+    if machines.ray is None and len(jobs) < 2:
+        machines = Machines()
+    return in_order(machines, partial(make_images, str(root.resolve())), jobs, "go on with --resume")
 
 
 def _jobs(config: SynthConfig, missing: Sequence[int]) -> Iterator[list[int]]:
@@ -116,66 +95,11 @@ def _jobs(config: SynthConfig, missing: Sequence[int]) -> Iterator[list[int]]:
         yield list(missing[start : start + CHUNK])
 
 
-def _in_processes(machines: Machines, root: Path, jobs: Sequence[list[int]]) -> Iterator[int]:
-    """New processes, not forked: OpenGL does not outlive a fork."""
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(machines.workers, len(jobs)), context, initializer=_single_threaded) as pool:
-        futures: set[Future[int]] = {pool.submit(make_images, str(root), job) for job in jobs}
-        try:
-            while futures:
-                finished, futures = wait(futures, return_when=FIRST_COMPLETED)
-                yield from (future.result() for future in finished)
-        except BrokenProcessPool as error:
-            raise OutputError("a worker process was killed (out of memory?): go on with --resume, and fewer workers."
-                              ) from error  # fmt: skip
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-
-def _on_ray(machines: Machines, root: Path, jobs: Sequence[list[int]]) -> Iterator[int]:
-    """The same on a Ray cluster, whose machines must see the folder under the same path."""
-    try:
-        import ray
-    except ImportError as error:
-        raise ConfigError("--ray needs the extra: pip install 'posekit[ray]'.") from error
-    local = machines.ray == "local"
-    try:
-        options = {"num_cpus": machines.workers, "include_dashboard": False} if local else {"address": machines.ray}
-        ray.init(**options, log_to_driver=False, logging_level=logging.ERROR)
-    except (ConnectionError, ValueError, RuntimeError) as error:
-        raise ConfigError(f"--ray {machines.ray}: no Ray cluster answers there: {error}") from error
-    try:
-        task = ray.remote(num_cpus=1)(_on_node)
-        pending = [task.remote(str(root.resolve()), job) for job in jobs]
-        while pending:
-            finished, pending = ray.wait(pending)
-            for count, problem in ray.get(finished):
-                if problem:
-                    raise OutputError(f"a Ray worker failed: {problem}")
-                yield count
-    finally:
-        ray.shutdown()
-
-
-def _on_node(root: str, numbers: list[int]) -> tuple[int, str]:
-    _single_threaded()
-    if not (Path(root) / CONFIG).is_file():
-        return 0, f"there is no {root} on its machine; --out must lie on a file system that all machines share."
-    try:
-        return make_images(root, numbers), ""
-    except PosekitError as error:
-        return 0, str(error)
-
-
-def _single_threaded() -> None:
-    """One process of several: no threads of its own."""
-    os.environ["LP_NUM_THREADS"] = "0"
-    cv2.setNumThreads(0)
-
-
 def make_images(root: str, numbers: Sequence[int]) -> int:
     """Make and write images of the data set that was begun in ``root``, all of one block or of several."""
     folder = Path(root)
+    if not (folder / CONFIG).is_file():
+        raise OutputError(f"there is no {root} on a worker's machine: --out must lie where all machines see it.")
     config, ids, maker = _maker(folder)
     writer = BopWriter(folder, config.split, config.quality or None)
     made = 0

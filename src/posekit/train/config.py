@@ -105,7 +105,7 @@ class TrainConfig:
 
     recipe: str = "lite"
     steps: int = 7000  # optimiser steps of the schedule
-    minutes: float = 0.0  # of wall clock, where above 0; whichever ends first
+    minutes: float = 0.0  # of wall clock for all that is done, where above 0; whichever ends first
     epochs: int = 0  # where above 0, the steps follow from the sources (paper recipe)
     seed: int = 1
     # validate, save, log: every so many steps

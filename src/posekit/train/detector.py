@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -41,8 +42,8 @@ from posekit.train.data.tabletop_stream import (
     photographed,
 )
 from posekit.train.loop import Show, Trainer, make_fabric
-from posekit.train.pose import CONFIG, claim, is_first
-from posekit.train.sources import Sources, read_sources
+from posekit.train.pose import CONFIG, claim, is_first, sources_of
+from posekit.train.sources import Sources
 
 HELD_BACK = 1_000_003  # the seed of the validation's scenes, apart from all that trainings use
 
@@ -130,8 +131,9 @@ def resume_detector(out: Path, show: Show | None = None) -> list[dict[str, str]]
 
 
 def _train(config: DetectorConfig, out: Path, show: Show | None) -> list[dict[str, str]]:
+    began = time.monotonic()
     fabric = make_fabric(config)
-    sources = read_sources(config.sources)
+    sources = sources_of(config.sources, show)
     if not config.agnostic and not sources.models:
         raise ConfigError("a detector is trained for meshes: pass --models MESH ..., or --agnostic for any object.")
     if config.agnostic and sources.distractors:
@@ -148,7 +150,7 @@ def _train(config: DetectorConfig, out: Path, show: Show | None) -> list[dict[st
     if config.epochs:
         steps = max(1, config.epochs * config.epoch // (config.stream.batch * fabric.world_size))
         config = dataclasses.replace(config, steps=steps)
-    return Trainer(config, task, fabric, out, show).run()
+    return Trainer(config, task, fabric, out, show).run(began)
 
 
 def _classes(config: DetectorConfig, sources: Sources) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -55,7 +55,8 @@ class Schedule(Protocol):
 
     @property
     def minutes(self) -> float:
-        """Wall-clock minutes after which it ends, if the steps have not ended it before; 0 = no limit."""
+        """Wall-clock minutes in which all is done, from the meshes to the last export, if the steps have not ended it
+        before; 0 = no limit."""
 
     @property
     def seed(self) -> int:
@@ -241,6 +242,15 @@ class Means:
         return {} if self.mean is None else dict(zip(self.names, self.mean.tolist(), strict=True))
 
 
+Reserve = Callable[[float], float]  # from a validation's seconds to those of what follows the training
+MARGIN = 1.1  # how much longer than the last time the last validation and export may take
+
+
+def _nothing_follows(_: float) -> float:
+    """Where the training is all."""
+    return 0.0
+
+
 def _show_nothing(progress: Progress) -> None:
     """Where nobody watches."""
 
@@ -260,16 +270,26 @@ class Trainer:
         self.step, self.seconds, self.score = 0, 0.0, math.nan
         self.running = Means()
         self.shown = self.exported = 0.0
+        self.logged = self.validated = self.saved = -1  # the step of the last time
+        self.took = {"step": 0.0, "validation": 0.0, "export": 0.0, "checkpoint": 0.0}  # seconds, the last time
+        self.reserve: Reserve = _nothing_follows
+        self.began = time.monotonic()  # where ``seconds`` begins
 
     # --- the loop ---
 
-    def run(self) -> list[dict[str, str]]:
+    def run(self, began: float | None = None, reserve: Reserve = _nothing_follows) -> list[dict[str, str]]:
         """Train to the end; returns the validations' rows, the first before and the last after the training.
 
+        With ``minutes`` the steps end so early that the last validation, export and checkpoint still fit, by what they
+        took before; there is one step in any case. began: when the minutes began, of `time.monotonic`; by default now.
+        reserve: how many seconds are left for what follows.
         Goes on from the last checkpoint where there is one. Raises TrainingError where the loss is not finite,
         OutputError where the disk is full.
         """
+        self.began, self.reserve = time.monotonic() if began is None else began, reserve
         resumed = self._resume()
+        self.began -= self.seconds
+        first = self.step
         batches = self._batches(self.step)
         ready = [next(batches) for _ in range(1 if resumed else max(1, self.task.measured))]
         if not resumed:
@@ -278,20 +298,24 @@ class Trainer:
         curves = Curves(self.out, self.step) if self.first else None
         if curves and not curves.rows("validation"):
             self._validate(curves)
-        clock = time.monotonic() - self.seconds
         overfitted = next(batches) if self.config.overfit else None
+        self._look_at_the_clock()
+        self.shown = self.exported = self.seconds
         try:
             with self._profiler() as profiler:
-                while (done := self._done()) < 1:
+                while (done := self._done()) < 1 or self.step == 0:
                     started = time.monotonic()
                     batch = overfitted or next(batches)
                     waited = time.monotonic() - started
                     self.train_step(batch, done, {"waited": waited})
-                    self.seconds = time.monotonic() - clock
+                    self._look_at_the_clock()
+                    self.took["step"] = time.monotonic() - started
                     if profiler is not None:
                         profiler.step()
                     if curves:
                         self._now_and_then(curves)
+                if curves and self.step > first:
+                    self._finish(curves)
         finally:
             if curves:
                 curves.close()
@@ -360,48 +384,73 @@ class Trainer:
         )
 
     def _done(self) -> float:
-        """How much of the training is behind, the same number in all processes."""
-        done = self.step / self.config.steps
-        if self.config.minutes > 0:
-            done = max(done, self.seconds / (60 * self.config.minutes))
-            if self.fabric.world_size > 1:
-                done = self.fabric.broadcast(done)
+        """How much of the training is behind, the same number in all processes: the first one's."""
+        self._look_at_the_clock()
+        done = self._share()
+        if self.config.minutes > 0 and self.fabric.world_size > 1:
+            done = self.fabric.broadcast(done)
         return float(done)
 
+    def _look_at_the_clock(self) -> None:
+        self.seconds = time.monotonic() - self.began
+
     def _now_and_then(self, curves: Curves) -> None:
-        ended = self._share() >= 1
-        logged = self.step % self.config.log == 0 or ended
+        logged = self.step % self.config.log == 0
         if logged or self.seconds - self.shown >= READ_EVERY:
             self._read_losses(curves if logged else None)
         self.score = math.nan
         due = 0 < self.config.export_seconds <= self.seconds - self.exported
-        if self.step % self.config.validate == 0 or ended:
+        if self.step % self.config.validate == 0:
             self._validate(curves)
         elif due:
             self._export({})
-        if self.step % self.config.save == 0 or due or ended:
+        if self.step % self.config.save == 0 or due:
             self.save()
             self.exported = self.seconds
+
+    def _finish(self, curves: Curves) -> None:
+        """What the last step has not led to yet."""
+        if self.logged != self.step:
+            self._read_losses(curves)
+        if self.validated != self.step:
+            self._validate(curves)
+        if self.saved != self.step:
+            self.save()
+        self._look_at_the_clock()
 
     def _read_losses(self, curves: Curves | None) -> None:
         """Read the losses, which waits for the device."""
         self.shown, means = self.seconds, self.means
         if self.running.failed is not None and float(self.running.failed) > PATIENCE:
             self._check_finite(math.nan, math.nan)
-        self.show(Progress(self.step, self._share(), self.seconds, means))
+        self.show(Progress(self.step, min(1.0, self._share()), self.seconds, means))
         if curves is not None:
+            self.logged = self.step
             curves.add("train", self.step, self.seconds, means)
 
     def _share(self) -> float:
-        """As `_done`, by this process's own clock."""
-        byclock = self.seconds / (60 * self.config.minutes) if self.config.minutes > 0 else 0.0
-        return max(self.step / self.config.steps, byclock)
+        """As `_done`, by this process's own clock: of the minutes without what is still to be done after the steps."""
+        done = self.step / self.config.steps
+        if self.config.minutes <= 0:
+            return done
+        left = 60 * self.config.minutes - MARGIN * sum(self.took.values()) - self.reserve(self.took["validation"])
+        return max(done, self.seconds / left if left > 0 else 1.0)
+
+    @contextmanager
+    def _stage(self, name: str, label: str = "") -> Iterator[None]:
+        """Tells what is being done, by its label, and keeps how long it takes."""
+        if label:
+            self.show(Progress(self.step, min(1.0, self._share()), self.seconds, {}, label))
+        started = time.monotonic()
+        yield
+        self.took[name] = time.monotonic() - started
 
     def _validate(self, curves: Curves) -> None:
         averaged = self.average.module
         averaged.eval()
-        with torch.no_grad():
+        with self._stage("validation", "validation"), torch.no_grad():
             found = self.task.validate(averaged)
+        self.validated = self.step
         self.score = found["score"]
         curves.add("validation", self.step, self.seconds, found)
         self._export(found)
@@ -409,7 +458,8 @@ class Trainer:
     def _export(self, found: Mapping[str, float]) -> None:
         """The averaged weights. found: their validation, where there was one."""
         about = {"recipe": self.config.recipe, "steps": self.step, "hours": self.seconds / 3600, "held_back": found}
-        self.task.export(self.average.module, self.out, about)
+        with self._stage("export", "export"):
+            self.task.export(self.average.module, self.out, about)
 
     # --- state ---
 
@@ -427,7 +477,9 @@ class Trainer:
         state = {f"net.{k}": v for k, v in self.task.nets.state_dict().items()}
         state |= {f"average.{k}": v for k, v in self.average.state_dict().items()}
         state |= {f"optimiser.{k}": v for k, v in optimiser_tensors(self.raw).items()}
-        self.checkpoints.save(Checkpoint(self.step, self.seconds, self.score, self.means, state))
+        with self._stage("checkpoint"):
+            self.checkpoints.save(Checkpoint(self.step, self.seconds, self.score, self.means, state))
+        self.saved = self.step
 
     def _resume(self) -> bool:
         """Take over the last checkpoint, whose number the first process decides."""

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import math
 import os
+import time
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +25,7 @@ from posekit.nets.weights import Networks, build, load_networks, save_networks
 from posekit.render import Renderer
 from posekit.synth.procedural import random_object
 from posekit.train.calibrate import SEED, calibrate
-from posekit.train.config import TrainConfig, read_config, write_config
+from posekit.train.config import SourceConfig, TrainConfig, read_config, write_config
 from posekit.train.data.crop_stream import Catalogue
 from posekit.train.lite import LiteTask
 from posekit.train.loop import Progress, Show, Task, Trainer, keep_memory, make_fabric
@@ -31,7 +33,12 @@ from posekit.train.measure import CaseSource, rendered_cases
 from posekit.train.paper import PaperTask
 from posekit.train.sources import Sources, read_sources
 
+log = logging.getLogger("posekit")
+
 CONFIG = "config.toml"
+# Of the minutes of a training: at most so much is left for the calibration; a rendering takes so much longer there than
+# in a validation (five refinements instead of four, and it is drawn first); on fewer renderings it learns nothing.
+CALIBRATION_SHARE, CALIBRATION_PACE, FEWEST_CALIBRATED = 0.25, 1.5, 60
 PROCEDURAL = 64  # objects of the paper recipe where no mesh is given
 
 
@@ -54,18 +61,49 @@ def resume_pose(out: Path, show: Show | None = None) -> list[dict[str, str]]:
 
 
 def _train(config: TrainConfig, out: Path, show: Show | None) -> list[dict[str, str]]:
+    began = time.monotonic()
     keep_memory()
     fabric = make_fabric(config)
-    sources = read_sources(config.sources)
+    sources = sources_of(config.sources, show)
     torch.manual_seed(config.seed)  # the same new networks in every process
     task = make_task(config, sources)
     if fabric.global_rank == 0:
         _make(out)
         write_text_atomic(out / CONFIG, write_config(config))
-    rows = Trainer(_scheduled(config, task, fabric.world_size), task, fabric, out, show).run()
+    trainer = Trainer(_scheduled(config, task, fabric.world_size), task, fabric, out, show)
+    rows = trainer.run(began, lambda validation: _calibration_cases(config, validation)[1])
+    count = config.calibrate
+    if config.minutes > 0:
+        left = 60 * config.minutes - trainer.seconds
+        count = min(count, _calibration_cases(config, trainer.took["validation"], left)[0])
     if rows and config.calibrate:
-        _calibrate(config, sources, config.recipe, out, out, show)
+        if count < config.calibrate:
+            log.info(
+                "the predicted angle is %scalibrated (%d of %d renderings): the %g minutes allow no more. To do it on "
+                "all: posekit train angle --weights %s.",
+                "" if count else "not ", count, config.calibrate, config.minutes, out,
+            )  # fmt: skip
+        if count:
+            _calibrate(dataclasses.replace(config, calibrate=count), sources, config.recipe, out, out, show)
     return rows
+
+
+def sources_of(config: SourceConfig, show: Show | None) -> Sources:
+    """What is trained on, which is told while it is read. Raises MeshError, ConfigError."""
+    if show is not None and is_first():
+        show(Progress(0, 0.0, 0.0, {}, "preparing meshes"))
+    return read_sources(config)
+
+
+def _calibration_cases(config: TrainConfig, validation: float, left: float | None = None) -> tuple[int, float]:
+    """On how many renderings the angle is calibrated within a training's minutes, and the seconds that this takes: all,
+    or as many as fit into a part of them, or none where that is too few to learn from. validation: its seconds. left:
+    seconds that there are; by default that part."""
+    left = CALIBRATION_SHARE * 60 * config.minutes if left is None else left
+    each = CALIBRATION_PACE * validation / max(1, config.cases)
+    count = config.calibrate if each * config.calibrate <= left else int(left / each)
+    count = 0 if count < min(FEWEST_CALIBRATED, config.calibrate) else count
+    return count, each * count
 
 
 def calibrate_angle(config: TrainConfig, weights: Path | None, out: Path, show: Show | None = None) -> None:

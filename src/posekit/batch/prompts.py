@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from posekit.cli.options import MaskFrom
 from posekit.detect import BoxPrompt, Detector, MaskPrompt
 from posekit.errors import PromptError
 from posekit.io.load import load_mask, parse_box
 from posekit.lens import Lens
 
 
-def detector_for(box: str | None, mask: Path | None, mask_from: MaskFrom, lens: Lens | None = None) -> Detector:
+def detector_for(box: str | None, mask: Path | None, mask_from: str, lens: Lens | None = None) -> Detector:
     """As `prompt_for`. Raises PromptError where neither is given, or both are."""
     found = prompt_for(box, mask, mask_from, lens=lens)
     if found is None:
@@ -22,7 +21,7 @@ def detector_for(box: str | None, mask: Path | None, mask_from: MaskFrom, lens: 
 def prompt_for(
     box: str | None,
     mask: Path | None,
-    mask_from: MaskFrom,
+    mask_from: str,
     detections: Path | None = None,
     image: Path | None = None,
     lens: Lens | None = None,
@@ -31,9 +30,7 @@ def prompt_for(
 
     lens: of the photograph that they speak of, where it was undistorted: what they say is moved with it.
     """
-    given = [name for name, value in (("--box", box), ("--mask", mask), ("--detections", detections)) if value]
-    if len(given) > 1:
-        raise PromptError(f"{' and '.join(given)} were both given; one says where the object is: pass one of them.")
+    check_one(box, mask, detections)
     if mask is not None:
         if lens is not None:
             return MaskPrompt(lens.undistorted_mask(load_mask(mask, lens.camera.size)))
@@ -47,3 +44,10 @@ def prompt_for(
 
         return DetectionsFile.read(detections, image)
     return None
+
+
+def check_one(box: str | None, mask: Path | None, detections: Path | None = None) -> None:
+    """Raises PromptError where several say where the object is."""
+    given = [name for name, value in (("--box", box), ("--mask", mask), ("--detections", detections)) if value]
+    if len(given) > 1:
+        raise PromptError(f"{' and '.join(given)} were both given; one says where the object is: pass one of them.")
