@@ -471,6 +471,17 @@ def test_a_recording_without_rerun_says_what_to_install(model: ObjectModel, monk
         Recorder(Path("a.rrd"), [model])
 
 
+def test_a_box_gives_the_first_frame(folder: Path, tmp_path: Path, example: Example) -> None:
+    box = ",".join(f"{v:.0f}" for v in example.box)
+    result = run(
+        folder, *make_camera_flag(folder), "--box", box, "--frames", 1, "--no-overlay", "--out", tmp_path / "a"
+    )
+    [line] = (tmp_path / "a" / "poses.jsonl").read_text().splitlines()
+    assert json.loads(line)["state"] == RESTARTED, result.output
+    both = run(folder, "--box", box, "--pose", folder / "pose.json", "--out", tmp_path / "b")
+    assert both.exit_code == 1 and "pass --pose for several" in both.stderr
+
+
 def test_nothing_to_track_is_an_error(folder: Path, tmp_path: Path) -> None:
     (folder / "damaged").mkdir(exist_ok=True)
     (folder / "damaged" / "0.png").write_bytes(b"no picture")
