@@ -215,9 +215,7 @@ def test_cells_are_prepared_for_many_points_at_many_poses(monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("scale", [0.02, 0.2])
-def test_the_cells_hold_the_points_of_all_but_the_farthest_poses(
-    scale: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_cells_hold_the_points_of_all_but_the_farthest_poses(scale: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """At most half the object's longest side beside its box."""
     rng, regions = np.random.default_rng(4), []
     cloud = rng.uniform(0, 1, (600, 3)) * [1.0, 2.0, 4.0] + [5.0, -3.0, 1.0]
