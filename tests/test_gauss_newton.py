@@ -126,6 +126,23 @@ def test_the_loop_ends_when_turn_and_shift_are_still(k: int, sign: float) -> Non
     assert scripted(1.02 * limit * np.eye(6)[k], np.zeros(6), np.zeros(6))[1] == 2
 
 
+def test_further_unknowns_do_not_keep_the_loop_going() -> None:
+    assert scripted([0, 0, 0, 0, 0, 0, 5.0, 5.0], np.zeros(8), extra=2)[1] == 1
+
+
+def test_a_point_three_standard_deviations_off_counts_a_quarter() -> None:
+    points, sigma = POINTS[:3], np.array([2.0, 0.5, 2.0])
+    pixels = CAMERA.project(POSE.apply(points))
+    exact, _ = Points(points, pixels, np.ones(3), sigma).equations(POSE, CAMERA)
+    alone, _ = Points(points[:1], pixels[:1], np.ones(1), sigma[:1]).equations(POSE, CAMERA)
+    off = pixels + [[3.6, 4.8], [0, 0], [0, 0]]  # 6 pixels
+    found, _ = Points(points, off, np.ones(3), sigma).equations(POSE, CAMERA)
+    np.testing.assert_allclose(exact - found, 0.75 * alone, rtol=1e-6, atol=1e-9 * np.abs(alone).max())
+    x, y, z = POSE.apply(points[0])
+    along_z = [640.0 * x / z**2, 655.0 * y / z**2]  # how far a metre along z moves it, pixels
+    assert alone[5, 5] == pytest.approx(np.dot(along_z, along_z) / 2.0**2)
+
+
 def test_the_turn_that_ends_the_loop_does_not_depend_on_the_distance() -> None:
     far = Pose(POSE.R, np.array([0.1, 0.2, 3.0]))
     for right, calls in (([1.1e-3, 0, 0, 0, 0, 0], 2), ([0, 0, 0, 2.8e-3, 0, 0], 1), ([0, 0, 0, 0, 3.2e-3, 0], 2)):
