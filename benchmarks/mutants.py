@@ -44,7 +44,7 @@ MODULES = {
     "geometry": ["test_geometry"],
     "camera": ["test_camera", "test_zoom"],
     "zoom": ["test_zoom"],
-    "metrics": ["test_metrics"],
+    "metrics": ["test_metrics", "test_nearest"],
     "align/gauss_newton": ["test_gauss_newton", "test_pnp"],
     "align/pnp": ["test_pnp"],
     "align/mask_edge": ["test_gauss_newton", "test_mask_edge"],

@@ -22,6 +22,7 @@ from PIL import Image
 from posekit.datasets.bop import BopDataset
 from posekit.errors import CameraError, ImageError, InputError, MeshError, PromptError
 from posekit.geometry import random_rotation
+from posekit.mesh.model import ObjectModel
 
 R = random_rotation(np.random.default_rng(1))
 
@@ -444,3 +445,67 @@ def test_poses_nearer_than_a_centimetre_are_taken_for_metres(far: float, known: 
     else:
         with pytest.raises(InputError, match="seems to be in metres"):
             BopDataset(root).instances(2, 3)
+
+
+def test_only_numbered_folders_are_scenes(root: Path) -> None:
+    (root / "test" / "notes").mkdir()
+    (root / "test" / "77").write_text("")
+    assert BopDataset(root).scenes() == [2, 40]
+
+
+def test_one_target_without_an_object_is_refused(root: Path) -> None:
+    put(
+        root / "test_targets_bop19.json",
+        [{"scene_id": 2, "im_id": 3, "obj_id": 5, "inst_count": 1}, {"scene_id": 2, "im_id": 11}],
+    )
+    with pytest.raises(InputError, match="is no list of targets with scene_id"):
+        BopDataset(root).images()
+
+
+def test_one_entry_without_a_number_is_refused(root: Path) -> None:
+    path = root / "test" / "000002" / "scene_camera.json"
+    put(path, json.loads(path.read_text()) | {"first": {}})
+    with pytest.raises(InputError, match="does not map image numbers to entries"):
+        BopDataset(root).camera(2, 3, (64, 48))
+
+
+@pytest.mark.parametrize(("share", "told"), [(0.8, True), (0.96, False), (1.04, False), (1.2, True)])
+def test_a_stated_diameter_is_told_from_a_twentieth_on(
+    share: float, told: bool, root: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    put(root / "models" / "models_info.json", {"5": {"diameter": share * float(np.linalg.norm((105, 60, 40)))}})
+    BopDataset(root).model(5)
+    assert ("models_info.json says" in caplog.text) == told and len(caplog.records) == told
+
+
+def test_a_mesh_in_millimetres_is_read_once_and_nothing_is_told(
+    root: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, load = [], ObjectModel.load
+
+    def counted(path: Path, units: str) -> ObjectModel:
+        asked.append(units)
+        return load(path, units=units)
+
+    monkeypatch.setattr(ObjectModel, "load", counted)
+    for stated in ({}, {"5": {"diameter": float(np.linalg.norm((105, 60, 40)))}}):
+        put(root / "models" / "models_info.json", stated)
+        BopDataset(root).model(5)
+    assert asked == ["mm", "mm"] and not caplog.records
+    trimesh.creation.box((1.0, 2.0, 2.0)).export(root / "models" / "obj_000005.ply")
+    put(root / "models" / "models_info.json", {"5": {"diameter": 3.0}})
+    BopDataset(root).model(5)
+    assert not caplog.records, "as small as it is said to be"
+
+
+def test_a_mesh_in_centimetres_is_told_with_its_sizes(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    trimesh.creation.box((10.0, 20.0, 20.0)).export(root / "models" / "obj_000005.ply")
+    put(root / "models" / "models_info.json", {"5": {"diameter": 300.0}})
+    assert BopDataset(root).model(5).diameter == pytest.approx(0.3)
+    assert "would make it 30 mm long; it is taken for centimetres, 300 mm long" in caplog.text
+
+
+def test_a_mesh_of_no_size_that_fits_is_refused_with_its_size(root: Path) -> None:
+    trimesh.creation.box((1e6, 2e6, 2e6)).export(root / "models" / "obj_000005.ply")
+    with pytest.raises(MeshError, match=r"obj_000005\.ply.*The meshes of a data set in BOP layout are in mm"):
+        BopDataset(root).model(5)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from conftest import points
-from posekit.camera import Camera, Zoom, box_iou, mask_box, mask_iou
+from posekit.camera import Box, Camera, Zoom, box_iou, box_mask, mask_box, mask_iou
 from posekit.errors import CameraError
 from posekit.view import View
 
@@ -45,6 +45,8 @@ def test_gl_projection_puts_pixel_centres_where_opengl_samples(camera: Camera, p
     np.testing.assert_allclose(window - 0.5, camera.project(p), atol=1e-6)
     depth = [camera.gl_projection(near, far) @ [0, 0, z, 1] for z in (near, far)]
     np.testing.assert_allclose([d[2] / d[3] for d in depth], [-1, 1], atol=1e-9)
+    along_axis = [camera.gl_projection(near, far) @ [0, 0, z, 1] for z in p[:, 2]]  # depth is that of z alone
+    np.testing.assert_allclose(ndc[:, 2], [d[2] / d[3] for d in along_axis], atol=1e-9)
 
 
 @given(cameras, points, st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3)), st.floats(0.02, 0.5))
@@ -137,7 +139,7 @@ def test_rays_through_a_box() -> None:
 def test_a_camera_has_pixels(size: tuple[int, int]) -> None:
     with pytest.raises(CameraError, match="at least 1 pixel"):
         Camera(100.0, 100.0, 5.0, 5.0, *size)
-    assert Camera(100.0, 100.0, 0.0, 0.0, 1, 1).size == (1, 1)
+    assert Camera(0.5, 0.75, 0.0, 0.0, 1, 1).size == (1, 1)
     with pytest.raises(CameraError, match="3x3"):
         Camera.from_K(np.eye(2), 10, 10)
     np.testing.assert_array_equal(
@@ -184,3 +186,35 @@ def test_intersection_over_union() -> None:
     mask[:, :2] = True
     assert mask_iou(mask, mask) == 1
     assert mask_iou(mask, np.roll(mask, 1, axis=1)) == pytest.approx(1 / 3)
+    mask[:] = False
+    mask[1, 2] = True
+    assert mask_iou(mask, mask) == 1, "a single pixel"
+
+
+def test_intersection_over_union_in_both_directions() -> None:
+    assert box_iou((0, 0, 4, 10), (1, 2, 6, 5)) == pytest.approx(9 / (40 + 15 - 9))
+    assert box_iou((0, 0, 10, 4), (2, 1, 5, 6)) == pytest.approx(9 / (40 + 15 - 9))
+    assert box_iou((0, 0, 0.2, 0.1), (0.1, 0, 0.3, 0.1)) == pytest.approx(1 / 3), "less than a pixel"
+
+
+@pytest.mark.parametrize(
+    ("box", "columns", "rows"),
+    [
+        ((2, 1, 5, 4), range(2, 5), range(1, 4)),
+        ((1.6, 0.7, 4.4, 3.6), range(2, 4), range(1, 4)),  # the greater part of a pixel counts
+        ((-3, -2, 20, 30), range(9), range(6)),
+        ((3.2, 2.2, 3.3, 2.3), [3], [2]),  # at least one pixel
+        ((-4, -4, 0.2, 0.3), [0], [0]),
+        ((8.8, 5.9, 12, 12), [8], [5]),
+        ((-4, 1, 0, 4), [], []),  # beside the picture
+        ((1, -4, 4, 0), [], []),
+        ((9, 1, 12, 4), [], []),
+        ((1, 6, 4, 9), [], []),
+        ((9, 6, 12, 9), [], []),
+        ((-4, -4, 0, 0), [], []),
+    ],
+)
+def test_a_filled_box(box: Box, columns: list[int], rows: list[int]) -> None:
+    wanted = np.zeros((6, 9), bool)
+    wanted[np.ix_(list(rows), list(columns))] = True
+    np.testing.assert_array_equal(box_mask(box, (9, 6)), wanted)

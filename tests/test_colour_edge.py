@@ -320,3 +320,28 @@ def test_contrast_is_largest_at_the_right_silhouette() -> None:
         assert contrast(view, wrong, colours) < right - 0.2
     assert contrast(view, np.zeros((HEIGHT, WIDTH), bool), colours) == 0
     assert abs(contrast(View(one_colour(RED), CAMERA), disc(30.0), colours)) < 0.05
+
+
+def test_contrast_compares_bands_of_three_pixels() -> None:
+    """The pixels that lie up to three pixels inside and outside the edge's own row, also at the picture's border."""
+    rng = np.random.default_rng(6)
+    view = View(rng.integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8), CAMERA)
+    colours = Colours(*rng.random((2, 32**3)).astype(np.float32))
+    silhouette = np.zeros((HEIGHT, WIDTH), bool)
+    silhouette[:70, 40:100] = True
+    chance = colours.posterior(view.image)
+    inner = np.zeros((HEIGHT, WIDTH), bool)
+    inner[:69, 41:99] = True
+    inner[:66, 44:96] = False
+    beside = np.hypot(*np.maximum(0, np.abs(CAMERA.pixel_grid() - [69.5, 34.5]) - [29.5, 34.5]).transpose(2, 0, 1))
+    outer = (beside > 1) & (cv2.dilate(silhouette.astype(np.uint8), edge._disc(4)) > 0)
+    assert beside[outer].max() < 4.5
+    found = contrast(view, silhouette, colours)
+    assert found == pytest.approx(chance[inner].mean() - chance[outer].mean(), abs=1e-6)
+
+
+def test_contrast_needs_an_inside_and_an_outside() -> None:
+    colours = Colours(*np.random.default_rng(6).random((2, 32**3)).astype(np.float32))
+    view = View(one_colour(RED), CAMERA)
+    assert contrast(view, np.ones((HEIGHT, WIDTH), bool), colours) == 0
+    assert contrast(view, disc(0.9), colours) == 0, "a few pixels without an inside"

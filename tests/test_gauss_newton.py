@@ -126,6 +126,23 @@ def test_the_loop_ends_when_turn_and_shift_are_still(k: int, sign: float) -> Non
     assert scripted(1.02 * limit * np.eye(6)[k], np.zeros(6), np.zeros(6))[1] == 2
 
 
+def test_further_unknowns_do_not_keep_the_loop_going() -> None:
+    assert scripted([0, 0, 0, 0, 0, 0, 5.0, 5.0], np.zeros(8), extra=2)[1] == 1
+
+
+def test_a_point_three_standard_deviations_off_counts_a_quarter() -> None:
+    points, sigma = POINTS[:3], np.array([2.0, 0.5, 2.0])
+    pixels = CAMERA.project(POSE.apply(points))
+    exact, _ = Points(points, pixels, np.ones(3), sigma).equations(POSE, CAMERA)
+    alone, _ = Points(points[:1], pixels[:1], np.ones(1), sigma[:1]).equations(POSE, CAMERA)
+    off = pixels + [[3.6, 4.8], [0, 0], [0, 0]]  # 6 pixels
+    found, _ = Points(points, off, np.ones(3), sigma).equations(POSE, CAMERA)
+    np.testing.assert_allclose(exact - found, 0.75 * alone, rtol=1e-6, atol=1e-9 * np.abs(alone).max())
+    x, y, z = POSE.apply(points[0])
+    along_z = [640.0 * x / z**2, 655.0 * y / z**2]  # how far a metre along z moves it, pixels
+    assert alone[5, 5] == pytest.approx(np.dot(along_z, along_z) / 2.0**2)
+
+
 def test_the_turn_that_ends_the_loop_does_not_depend_on_the_distance() -> None:
     far = Pose(POSE.R, np.array([0.1, 0.2, 3.0]))
     for right, calls in (([1.1e-3, 0, 0, 0, 0, 0], 2), ([0, 0, 0, 2.8e-3, 0, 0], 1), ([0, 0, 0, 0, 3.2e-3, 0], 2)):
@@ -233,6 +250,44 @@ def test_the_contours_equations_are_least_squares_with_a_prior() -> None:
     np.testing.assert_allclose(right, prior * back - weight * J.T @ residual(np.zeros(7)), rtol=1e-4, atol=1e-2)
     hidden = replace(look, clear=np.arange(30) < 15)
     assert np.trace(_equations(hidden, start, grown, config)[0]) < np.trace(normal)
+
+
+def edge_equations(distance: np.ndarray, **changed: object) -> tuple[np.ndarray, np.ndarray]:
+    given = {"R_view_cam": np.eye(3), "clear": np.ones(30, bool), "start": POSE, "grown": 0.0} | changed
+    crop = _Crop(CAMERA, given["R_view_cam"], POSE, POINTS, distance, NORMALS, given["clear"], 1.5)  # type: ignore[arg-type]
+    return _equations(crop, given["start"], given["grown"], MaskEdgeConfig())  # type: ignore[arg-type]
+
+
+def test_a_masks_edge_without_clear_points_leaves_the_given_pose() -> None:
+    """Known to 8 degrees, 6 pixels of the crop, 2 % of the distance; the mask's size to a pixel."""
+    normal, right = edge_equations(np.ones(30), clear=np.zeros(30, bool))
+    sideways = 6.0 / 640.0 * 0.6
+    deviations = np.array([np.deg2rad(8.0)] * 3 + [sideways] * 2 + [0.02 * 0.6, 1.0])
+    np.testing.assert_allclose(normal, np.diag(deviations**-2.0))
+    np.testing.assert_allclose(right, 0, atol=1e-9)
+
+
+def test_a_distance_of_a_pixel_counts_a_quarter() -> None:
+    distance = np.zeros(30)
+    distance[4] = 1.0
+    normal, _ = edge_equations(distance)
+    assert normal[6, 6] - 1.0 == pytest.approx((29 + 1 / 4) / (0.3**2 * 4.0 * 1.5))
+
+
+def test_distances_on_either_side_of_a_masks_edge_weigh_the_same() -> None:
+    """Also where all are large: then their median widens the knee."""
+    np.testing.assert_allclose(edge_equations(np.full(30, -20.0))[0], edge_equations(np.full(30, 20.0))[0])
+
+
+def test_the_equations_of_a_masks_edge_are_in_the_photographs_axes() -> None:
+    R, start = so3_exp([0.2, -0.4, 0.1]), moved(POSE, np.array([0.01, 0.02, -0.01, 0.001, 0.0, 0.002]))
+    distance = RNG.normal(size=30)
+    normal, right = edge_equations(distance, start=start, grown=0.3)
+    turned = edge_equations(distance, start=Pose.rotation(R.T) @ start, grown=0.3, R_view_cam=R)
+    axes = np.eye(7)
+    axes[:3, :3] = axes[3:6, 3:6] = R
+    np.testing.assert_allclose(turned[0], axes.T @ normal @ axes, rtol=1e-9, atol=1e-9 * np.abs(normal).max())
+    np.testing.assert_allclose(turned[1], axes.T @ right, rtol=1e-9, atol=1e-9 * np.abs(right).max())
 
 
 # --- the solve inside the network ------------------------------------------------------------------------------------

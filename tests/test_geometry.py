@@ -191,3 +191,37 @@ def test_rotations_are_drawn_all_over() -> None:
     drawn = np.array([random_rotation(rng) for _ in range(3000)])
     np.testing.assert_allclose(drawn.mean(axis=0), 0, atol=0.05)
     np.testing.assert_allclose((drawn**2).mean(axis=0), 1 / 3, atol=0.03)
+
+
+def test_moves_of_one_kind() -> None:
+    p, R = np.array([[0.1, 0.2, 0.3], [1.0, 2.0, 3.0]]), so3_exp([0.0, 0.0, np.pi / 2])
+    np.testing.assert_allclose(Pose.translation([1.0, 2.0, 3.0]).apply(p), p + [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(Pose.rotation(R).apply(p), np.stack([-p[:, 1], p[:, 0], p[:, 2]], axis=1), atol=1e-12)
+    np.testing.assert_allclose(Pose(R, [1.0, 0.0, 0.0]).apply([2.0, 3.0, 4.0]), [-2.0, 2.0, 4.0])
+    assert Pose.translation([1.0, 2.0, 3.0]).matrix.shape == Pose.rotation(R).matrix.shape == (4, 4)
+
+
+def test_a_matrix_with_one_number_missing_is_no_pose() -> None:
+    matrix = np.eye(4)
+    matrix[1, 3] = np.nan
+    with pytest.raises(ValueError, match="is not a rotation"):
+        Pose.from_matrix(matrix)
+
+
+def test_tiny_turns_have_a_logarithm() -> None:
+    for size in (1e-12, 1e-10, 1.5e-9, 3e-9, 1e-6):
+        np.testing.assert_allclose(so3_log(so3_exp([size, 0.0, -size])), [size, 0.0, -size], rtol=1e-6)
+
+
+def test_many_rotations_at_once() -> None:
+    vectors = np.random.default_rng(0).normal(size=(2, 5, 3)) * 0.5
+    R = so3_exp(vectors)
+    assert R.shape == (2, 5, 3, 3)
+    np.testing.assert_allclose(R[1, 3], so3_exp(vectors[1, 3]))
+    np.testing.assert_allclose(rotation_angle(R), np.linalg.norm(vectors, axis=-1))
+
+
+def test_noise_without_a_turn_adds_its_shift() -> None:
+    noise, start = PoseNoise(0.0, 1.0, (0.1, 0.2, 0.3)), Pose(np.eye(3), [1.0, 2.0, 3.0])
+    shift = noise.sample(np.random.default_rng(7))[1]
+    np.testing.assert_allclose(noise.disturb(start, np.random.default_rng(7)).t, start.t + shift)

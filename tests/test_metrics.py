@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from posekit import metrics
 from posekit.camera import Camera
@@ -44,6 +47,26 @@ def test_many_poses_at_once() -> None:
         assert np.ndim(one) == 0
         assert many.shape == (7,)
         assert many[3] == pytest.approx(one)
+
+
+def test_the_shift_of_many_poses() -> None:
+    shifts = np.array([[0.03, 0.0, 0.04], [0.0, 0.0, 0.0], [-0.02, 0.04, 0.04]])
+    moved = [Pose(GT.R, GT.t + shift) for shift in shifts]
+    np.testing.assert_allclose(metrics.pose_error(moved, GT)[1], [0.05, 0.0, 0.06], atol=1e-12)
+
+
+def test_poses_may_be_a_list_of_matrices_or_empty() -> None:
+    matrices = [turned(0.1).matrix, turned(0.2).matrix]
+    np.testing.assert_allclose(metrics.rotation_error(matrices, GT), [0.1, 0.2])
+    np.testing.assert_allclose(metrics.rotation_error([m.tolist() for m in matrices], GT), [0.1, 0.2])
+    assert metrics.rotation_error([], []).shape == (0,)
+
+
+def test_two_symmetries_are_both_tried() -> None:
+    symmetries = Symmetries.parse("z:2", [0.0, 0.0, 0.0]).transforms()
+    assert len(symmetries) == 2
+    assert metrics.mssd(turned(np.pi), GT, POINTS, symmetries) == pytest.approx(0, abs=1e-12)
+    assert metrics.mspd(turned(np.pi), GT, CAMERA, POINTS, symmetries) == pytest.approx(0, abs=1e-9)
 
 
 def test_an_array_of_another_shape_is_refused() -> None:
@@ -174,6 +197,40 @@ def test_no_poses_give_no_errors() -> None:
     none = np.zeros((0, 4, 4))
     for values in (metrics.add(none, none, POINTS), metrics.mssd(none, none, POINTS), metrics.adds(none, none, POINTS)):
         assert values.shape == (0,)
+
+
+def test_no_poses_need_no_nearest_points() -> None:
+    none, many = np.zeros((0, 4, 4)), np.random.default_rng(2).uniform(-0.05, 0.05, (600, 3))
+    assert metrics.adds(none, none, many).shape == (0,)
+
+
+def test_cells_are_prepared_for_many_points_at_many_poses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metrics, "_MANY", 1000)
+    monkeypatch.setattr(metrics, "_CELLS", 1000)
+    cloud = np.random.default_rng(2).uniform(0, 1, (500, 3))
+    for points, poses, prepared in ((500, 2, True), (500, 1, False), (499, 10, False)):
+        tree, between = cKDTree(cloud[:points]), np.tile(np.eye(4), (poses, 1, 1))
+        found = metrics._nearest_points(cloud[:points], tree, between)
+        assert (found is not None) == prepared
+
+
+@pytest.mark.parametrize("scale", [0.02, 0.2])
+def test_the_cells_hold_the_points_of_all_but_the_farthest_poses(scale: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At most half the object's longest side beside its box."""
+    rng, regions = np.random.default_rng(4), []
+    cloud = rng.uniform(0, 1, (600, 3)) * [1.0, 2.0, 4.0] + [5.0, -3.0, 1.0]
+    poses = [Pose(so3_exp(rng.normal(size=3) * scale), rng.normal(size=3) * [0.1, 0.3, 0.2]) for _ in range(101)]
+    monkeypatch.setattr(metrics, "_MANY", 0)
+    monkeypatch.setattr(metrics, "NearestPoints", lambda *given: regions.append(given[2:4]))
+    metrics._nearest_points(cloud, cKDTree(cloud), np.array([pose.matrix for pose in poses]))
+    low, high = cloud.min(axis=0), cloud.max(axis=0)
+    corners = np.array(list(itertools.product(*zip(low, high, strict=True))))
+    away = np.sort([np.abs(pose.apply(corners) - corners).max(axis=0) for pose in poses], axis=0)[98]
+    longest = (high - low).max()
+    margin = np.minimum(away, longest / 2) + 1e-3 * longest
+    assert (away > longest / 2).any() == (scale == 0.2)
+    [region] = regions
+    np.testing.assert_allclose(region, [low - margin, high + margin])
 
 
 def test_auc_is_the_area_under_accuracy_against_threshold() -> None:
