@@ -50,6 +50,10 @@ def demo(
     command += ["--camera", _numbers(camera.fx, camera.fy, camera.cx, camera.cy), "--box", _numbers(*example.box)]
     command += ["--weights", str(weights)] if weights else []
     typer.echo(f"the same by hand: {shlex.join(command)}")
+    typer.echo(
+        f"Look at {photo.with_name('overlay.png')}; then try a photograph of your own object: posekit estimate PHOTO "
+        "--model MESH --box X0,Y0,X1,Y1"
+    )
 
 
 def _numbers(*values: float) -> str:

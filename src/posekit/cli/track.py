@@ -64,6 +64,16 @@ def track(
             rich_help_panel=INPUT,
         ),
     ] = None,
+    box: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X0,Y0,X1,Y1", help="Box around the object in the first frame, pixels.", rich_help_panel=INPUT
+        ),
+    ] = None,
+    mask: Annotated[
+        Path | None,
+        typer.Option(metavar="PNG", help="Mask of the object in the first frame.", rich_help_panel=INPUT),
+    ] = None,
     detector: DetectorOption = None,
     units: UnitsOption = "auto",
     symmetry: SymmetryOption = None,
@@ -114,7 +124,9 @@ def track(
 ) -> None:
     """Follow objects through a video: poses as they come, and an overlay to look at."""
     from posekit.batch.meshes import load_meshes
+    from posekit.batch.prompts import prompt_for
     from posekit.cli.output import Destination
+    from posekit.detect.prompts import Detector, Successive
     from posekit.errors import ImageError, PromptError
     from posekit.io.pose_formats import pose_files
 
@@ -133,11 +145,16 @@ def track(
     starts = [load_pose(path) for path in pose] if pose else [None] * len(model)
     meshes = load_meshes(model, units, symmetry)
     sequence = ReadAhead(open_frames(source, camera), latest=live)
-    finder = None
-    if not pose or detector is not None:
+    prompt = prompt_for(box, mask, "none")
+    if prompt is not None and (pose or len(model) > 1):
+        raise PromptError("--box and --mask say where one --model is in the first frame: pass --pose for several.")
+
+    def make_finder() -> Detector:
         from posekit.detect.novel import make_detector
 
-        finder, _ = make_detector(detector, meshes, doubtful=True)
+        return make_detector(detector, meshes, doubtful=True)[0]
+
+    finder = Successive(prompt, make_finder)
     estimators = Estimators(preset=preset, weights=weights, device=device)
     trackers = [
         Tracker(mesh, pose=start, detector=finder, config=config, estimator=estimators(mesh))
@@ -160,7 +177,9 @@ def track(
         )
     if not counts.states.get("tracked", 0) + counts.states.get("restarted", 0):
         names = ", ".join(m.name for m in meshes)
-        raise PromptError(f"{names} was found in none of {counts.used} frames: pass --pose FILE for the first one.")
+        raise PromptError(
+            f"{names} was found in none of {counts.used} frames: pass --box, --mask or --pose for the first one."
+        )
     if require_reliable and counts.reliable < counts.used * len(trackers):
         raise typer.Exit(NOT_RELIABLE)
 

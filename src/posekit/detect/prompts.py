@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -176,3 +176,21 @@ def _fills(mask: Mask, inner: tuple[int, int, int, int]) -> bool:
 
 def _text(box: Box) -> str:
     return ",".join(f"{v:g}" for v in box)
+
+
+class Successive:
+    """A Detector that asks ``first``, where there is one, for the first picture, and for later ones another detector,
+    which ``make`` makes when it is needed."""
+
+    def __init__(self, first: Detector | None, make: Callable[[], Detector]) -> None:
+        self._first, self._make = first, make
+        self._then: Detector | None = None
+
+    def detect(self, view: View, models: Sequence[ObjectModel]) -> list[Detection]:
+        """The detections of whichever detector's turn it is."""
+        if self._first is not None:
+            first, self._first = self._first, None
+            return first.detect(view, models)
+        if self._then is None:
+            self._then = self._make()
+        return self._then.detect(view, models)

@@ -238,8 +238,9 @@ class SceneFrames:
         names = dict.fromkeys((f"{number:06d}", str(number)))
         ending = self.file.stem.removeprefix("scene_camera")
         for path in (self.folder / (k + ending) / (n + s) for n in names for k in ("rgb", "gray") for s in PICTURES):
-            if path.is_file():
-                return path
+            with suppress(OSError):  # a name that no file can have
+                if path.is_file():
+                    return path
         raise ImageError(f"the scene {self.folder} has no picture {number:06d} in rgb{ending}.")
 
 

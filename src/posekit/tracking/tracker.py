@@ -488,8 +488,9 @@ class Tracker:
             return Tracked(LOST)
         self._waiting = self.config.search
         detections = self.detector.detect(view, [self.model])
-        # detections of single frames may be wrong, whatever the detector: poses need the usual minimum score
-        [found] = find_instances(lambda _: self.estimator, view, [self.model], detections, SearchOptions())
+        # a person's word for the first frame is taken; later detections may be wrong, whatever the detector
+        options = SearchOptions.usual(detections) if self._last_pose is None else SearchOptions()
+        [found] = find_instances(lambda _: self.estimator, view, [self.model], detections, options)
         if not found.instances or not self._begin(view, found.instances[0].T_cam_obj, found.instances[0].angle):
             return Tracked(LOST)
         self._waiting = 0
