@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,15 +13,18 @@ import numpy as np
 
 from posekit import PoseEstimator, Renderer, estimate
 from posekit.geometry import Pose, so3_exp
-from posekit.render import render_views, view_rotations
-from posekit.synth.example import locomotive, make_example, make_film
+from posekit.metrics import rotation_error
+from posekit.render import Light, render_views, view_rotations
+from posekit.synth.example import Example, bottle, locomotive, make_example, make_film
 from posekit.tracking.tracker import Tracker
+from posekit.view import View
 from posekit.viewer import Photograph, PoseViewer, ViewerOptions, candidates_of
 from posekit.visualise import draw, figures
 from posekit.visualise.draw import Image
 
 MOST_BYTES = 200_000
 TILE = (320, 240)
+HALF = (300, 225)
 
 
 def pose() -> Image:
@@ -30,8 +34,12 @@ def pose() -> Image:
 
 
 def track() -> Image:
-    """Six frames of 60, in which the locomotive turns on the table, with the outlines that the tracker finds."""
+    """Six frames of 60, in which the locomotive turns on the table, with the outlines that the tracker finds.
+
+    Of each frame the part is shown in which the locomotive moves.
+    """
     tiles, captions, tracker = [], [], None
+    x0, y0 = 200, 70
     for number, example in enumerate(make_film(Renderer(), 60)):
         view = example.view
         if tracker is None:
@@ -40,10 +48,10 @@ def track() -> Image:
         found = tracker.step(view.image)
         if number % 11 != 4:
             continue
-        picture, told = view.image, found.T_cam_obj
-        if told is not None:
-            picture = figures.outlined(tracker.renderer, picture, view.camera, example.model, told)
-        tiles.append(draw.fit(picture, TILE))
+        picture, pose_found = view.image, found.T_cam_obj
+        if pose_found is not None:
+            picture = figures.outlined(tracker.renderer, picture, view.camera, example.model, pose_found)
+        tiles.append(picture[y0 : y0 + TILE[1], x0 : x0 + TILE[0]])
         captions.append(f"frame {number}: {found.state}")
     return draw.grid(tiles, columns=3, captions=captions)
 
@@ -52,6 +60,62 @@ def views() -> Image:
     """The example's mesh from twelve sides."""
     drawn = render_views(Renderer(samples=4), locomotive(), view_rotations(12), (240, 180), coords=False)
     return draw.grid([view.image for view in drawn], columns=6)
+
+
+def texture() -> Image:
+    """An object with parts of different colours, and a mesh with the same colours."""
+    return _case(make_example(Renderer()))
+
+
+def grey() -> Image:
+    """The same photograph, with a mesh that has no colours."""
+    example = make_example(Renderer())
+    return _case(replace(example, model=replace(example.model, colors=None)))
+
+
+def symmetric() -> Image:
+    """A bottle of one colour."""
+    return _case(make_example(Renderer(), model=bottle()))
+
+
+def pixels() -> Image:
+    """The example's picture with a sixth of its pixels a side: the object is some 35 pixels long."""
+    example, size = make_example(Renderer()), (107, 80)
+    camera = example.view.camera.resized(*size)
+    x, y = camera.width / example.view.camera.width, camera.height / example.view.camera.height
+    x0, y0, x1, y1 = example.box
+    view = View(draw.fit(example.view.image, size), camera)
+    return _case(replace(example, view=view, box=(x * x0, y * y0, x * x1, y * y1)))
+
+
+def shiny() -> Image:
+    """The locomotive with strong highlights, which the mesh does not have."""
+    light = Light(ambient=0.35, direction=(-0.45, -0.75, -0.5), diffuse=0.5, specular=1.6, shininess=6.0)
+    return _case(make_example(Renderer(), light=light))
+
+
+def _case(example: Example) -> Image:
+    """The picture's part with the object and the outline that is found from its box; the mesh in that pose."""
+    found = estimate(example.view, example.model, box=example.box)
+    x0, y0, x1, y1 = example.box
+    camera = example.view.camera
+    width = min(round(1.5 * max(x1 - x0, (y1 - y0) / 0.75)), camera.width)
+    height = min(round(0.75 * width), camera.height)
+    left = int(np.clip(round((x0 + x1 - width) / 2), 0, camera.width - width))
+    top = int(np.clip(round((y0 + y1 - height) / 2), 0, camera.height - height))
+    part = example.view.image[top : top + height, left : left + width]
+    window = camera.cropped(left, top, width, height).resized(*HALF)
+    renderer, T_cam_obj = Renderer(samples=4), found.T_cam_obj
+    photo = cv2.resize(part, HALF, interpolation=cv2.INTER_AREA if width > HALF[0] else cv2.INTER_NEAREST)
+    photo = figures.outlined(renderer, photo.astype(np.uint8), window, example.model, T_cam_obj)
+    [drawn] = renderer.render(example.model, [T_cam_obj], window, coords=False)
+    assert drawn.mask is not None
+    mesh = np.where(drawn.mask[..., None], drawn.image, np.uint8(235)).astype(np.uint8)
+    nearest = example.model.symmetries.nearest(T_cam_obj, example.T_cam_obj)
+    turn = float(rotation_error(nearest, example.T_cam_obj))
+    rating = "reliable" if found.reliable else "NOT RELIABLE"
+    error = f"{np.rad2deg(turn):.0f} degree{'s' if round(np.rad2deg(turn)) != 1 else ''}"
+    return draw.grid([photo, mesh], 2, [f"{rating}, true error {error}", "the mesh in that pose"])
 
 
 def page() -> Image:
@@ -85,6 +149,7 @@ def page() -> Image:
 
 
 PICTURES: dict[str, Callable[[], Image]] = {"pose": pose, "track": track, "views": views, "page": page}
+PICTURES |= {f"object-{case.__name__}": case for case in (texture, pixels, symmetric, shiny, grey)}
 
 
 def main(folder: Path, names: list[str]) -> None:

@@ -12,9 +12,9 @@ import pytest
 from posekit.camera import Camera, mask_box
 from posekit.geometry import Pose
 from posekit.mesh.model import ObjectModel
-from posekit.render import Renderer
+from posekit.render import Light, Renderer
 from posekit.results import Detection, Estimate, Source, Step
-from posekit.synth.example import Example, locomotive, make_example, ply
+from posekit.synth.example import Example, bottle, locomotive, make_example, ply
 from posekit.view import View
 from posekit.visualise import draw, figures
 
@@ -49,6 +49,26 @@ def test_the_example_is_the_same_every_time(example: Example, renderer: Renderer
     np.testing.assert_array_equal(again.view.image, example.view.image)
     other = make_example(renderer, seed=1)
     assert not np.allclose(other.T_cam_obj.R, example.T_cam_obj.R)
+
+
+def test_the_bottle_looks_the_same_after_its_symmetry(renderer: Renderer) -> None:
+    shown = make_example(renderer, model=bottle())
+    turn = shown.model.symmetries.continuous[0].turn(np.deg2rad(36))  # four of the forty segments
+    poses = [shown.T_cam_obj, shown.T_cam_obj @ turn]
+    drawn, turned = (view.mask for view in renderer.render(shown.model, poses, shown.view.camera))
+    assert drawn is not None and turned is not None
+    assert mask_box(drawn) == shown.box
+    assert (drawn != turned).mean() < 1e-4
+
+
+def test_a_light_changes_the_object_alone(example: Example, renderer: Renderer) -> None:
+    bright = make_example(renderer, light=Light(ambient=0.9, specular=1.6))
+    [drawn] = renderer.render(example.model, [example.T_cam_obj], example.view.camera)
+    assert drawn.mask is not None
+    around = cv2.dilate(drawn.mask.astype(np.uint8), np.ones((41, 41))) > 0  # JPEG's blocks reach beyond the outline
+    change = np.abs(bright.view.image.astype(float) - example.view.image).mean(axis=2)
+    assert change[drawn.mask].mean() > 20
+    assert change[~around].mean() < 1
 
 
 def test_the_mesh_comes_back_from_its_file(tmp_path: Path) -> None:

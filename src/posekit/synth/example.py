@@ -8,7 +8,7 @@ sensor noise and JPEG.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import cv2
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from posekit.camera import Box, Camera, mask_box
 from posekit.geometry import Pose, euler_xyz, view_rotation
 from posekit.mesh.model import ObjectModel
+from posekit.mesh.symmetries import Symmetries
 from posekit.render import Light, Renderer
 from posekit.view import View
 
@@ -45,12 +46,16 @@ class Example:
     box: Box
 
 
-def make_example(renderer: Renderer, seed: int = 0) -> Example:
-    """The locomotive on the table, 640x480; the seed moves it a little and draws the noise."""
+def make_example(renderer: Renderer, seed: int = 0, model: ObjectModel | None = None, light: Light = _SHADE) -> Example:
+    """The locomotive on the table, 640x480; the seed turns it about the table's normal and draws the noise.
+
+    model: another mesh, metres, standing on its z = 0. light: how the object is lit; the rest of the picture keeps its
+    light.
+    """
     rng = np.random.default_rng(seed)
     T_table_obj = Pose(euler_xyz([0, 0, np.deg2rad(rng.uniform(20, 50))]), np.zeros(3))
     room = _room(_fine(_CAMERA), _T_CAM_TABLE, rng)
-    return _example(renderer, locomotive(), T_table_obj, room, rng)
+    return _example(renderer, locomotive() if model is None else model, T_table_obj, room, rng, light)
 
 
 def make_film(renderer: Renderer, frames: int, seed: int = 0) -> Iterator[Example]:
@@ -64,13 +69,18 @@ def make_film(renderer: Renderer, frames: int, seed: int = 0) -> Iterator[Exampl
 
 
 def _example(
-    renderer: Renderer, model: ObjectModel, T_table_obj: Pose, room: NDArray[np.float32], rng: np.random.Generator
+    renderer: Renderer,
+    model: ObjectModel,
+    T_table_obj: Pose,
+    room: NDArray[np.float32],
+    rng: np.random.Generator,
+    light: Light = _SHADE,
 ) -> Example:
     T_cam_obj = _T_CAM_TABLE @ T_table_obj
     [seen] = renderer.render(model, [T_cam_obj], _CAMERA, rgb=False, coords=False)
     box = mask_box(seen.mask) if seen.mask is not None else None
     assert box is not None, "the example's object lies in front of its camera"
-    image = _photograph(renderer, model, T_cam_obj, room, rng)
+    image = _photograph(renderer, model, T_cam_obj, room, rng, light)
     return Example(model, View(image, _CAMERA), T_cam_obj, box)
 
 
@@ -97,6 +107,13 @@ class _Part:
 def locomotive() -> ObjectModel:
     """A toy, 0.19 m long, its wheels standing on z = 0, its front towards +x; no two sides look alike."""
     return _model("locomotive", [*_body(), *_gear()])
+
+
+def bottle() -> ObjectModel:
+    """A bottle of one colour, 0.16 m high, standing on z = 0: it looks the same after any turn about its z axis."""
+    profile = [(0, 0), (0.030, 0), (0.032, 0.004), (0.032, 0.095), (0.013, 0.125), (0.013, 0.150), (0.015, 0.150)]
+    mesh = _model("bottle", [_turned([*profile, (0.015, 0.160), (0, 0.160)], "z", (0, 0, 0), GREEN)])
+    return replace(mesh, symmetries=Symmetries.parse("z:inf", mesh.center))
 
 
 def _body() -> Iterator[_Part]:
@@ -200,14 +217,19 @@ def _fine(camera: Camera) -> Camera:
 
 
 def _photograph(
-    renderer: Renderer, model: ObjectModel, T_cam_obj: Pose, room: NDArray[np.float32], rng: np.random.Generator
+    renderer: Renderer,
+    model: ObjectModel,
+    T_cam_obj: Pose,
+    room: NDArray[np.float32],
+    rng: np.random.Generator,
+    light: Light,
 ) -> NDArray[np.uint8]:
     """The room, as `_room` draws it for the fine camera, with clutter and the model in it."""
     fine, clutter = _fine(_CAMERA), _clutter()
     dark = _shadow(clutter, _T_CAM_TABLE, _T_CAM_TABLE, fine) * _shadow(model, T_cam_obj, _T_CAM_TABLE, fine)
     scene = _paste(room * dark, renderer.render(clutter, [_T_CAM_TABLE], fine, light=_SHADE, coords=False)[0])
     scene = cv2.GaussianBlur(scene, (0, 0), 2.2)  # the lens is focused on the object
-    scene = _paste(scene, renderer.render(model, [T_cam_obj], fine, light=_SHADE, coords=False)[0])
+    scene = _paste(scene, renderer.render(model, [T_cam_obj], fine, light=light, coords=False)[0])
     return _develop(cv2.resize(scene, _CAMERA.size, interpolation=cv2.INTER_AREA), rng)
 
 
