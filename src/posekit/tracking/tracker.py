@@ -49,6 +49,7 @@ MOST_GROWN = 1.5  # pixels that an outline may look larger or smaller
 BIASED, MOST_BIASED, BIAS_RATE = 1.0, 2.0, 0.2
 ANGLE_OF_DOUBLE = math.radians(4.0)  # predicted angle at which that number doubles
 TINT_RATE = 0.15  # weight of a frame in the running tint
+COARSE = 1500  # of the mesh that is drawn where the outline is looked for in smaller crops
 FACES = 6000  # of the mesh that is drawn: a crop shows no more
 LEAST_SCALE, KNEE = 0.5, 2.5  # pixels, no correspondence is more exact; standard deviations
 
@@ -163,6 +164,7 @@ class Tracker:
         self.predictor = predictor or _predictor(self.estimator, config)
         self.renderer, self.detector = self.estimator.renderer, detector
         self._drawn = model.simplified(FACES)
+        self._coarse = model.simplified(COARSE)
         self._outline = model.hull_ctr
         self._executor = ThreadPoolExecutor(1, "posekit-network")
         self._given = pose  # a first pose that no frame has been compared with
@@ -332,7 +334,9 @@ class Tracker:
         pose = T_cam_ctr @ self.model.T_ctr_obj
         if not self._in_front(pose):
             return -1.0
-        seen, drawn = self._crops(view, pose, coords=False)
+        width, height = self.predictor.size
+        size = (width // 2, height // 2)
+        [seen], [drawn] = crops(view, self._coarse, self._outline, [pose], size, self.renderer, coords=False)
         assert drawn.mask is not None
         return contrast(seen, drawn.mask, colours)
 
@@ -345,8 +349,8 @@ class Tracker:
             pose = state.pose @ self.model.T_ctr_obj
             if not self._in_front(pose):
                 return start
-            size = (width // scale, height // scale)
-            [seen], [drawn] = crops(view, self._drawn, self._outline, [pose], size, self.renderer)
+            size, mesh = (width // scale, height // scale), self._drawn if scale == 1 else self._coarse
+            [seen], [drawn] = crops(view, mesh, self._outline, [pose], size, self.renderer)
             lines = outline_lines(seen, drawn, colours, colours.seen(seen), self.model.center)
             if lines is None:
                 continue
@@ -503,9 +507,9 @@ def _about(pose: Pose, camera: Camera, spread: tuple[float, float, float]) -> Ga
 
 
 def _moved_little(motion: Pose, pose: Pose, before: Keyframe | None) -> bool:
-    """Whether the last motion is below a pixel of the crop, so that to repeat it changes nothing."""
+    """Whether the last motion is below four pixels of the crop: then the outline is found without repeating it."""
     camera = None if before is None else before.drawn.camera
-    return camera is None or float(np.linalg.norm(motion.t)) * camera.fx / max(float(pose.t[2]), 1e-6) < 1.0
+    return camera is None or float(np.linalg.norm(motion.t)) * camera.fx / max(float(pose.t[2]), 1e-6) < 4.0
 
 
 def _predictor(estimator: PoseEstimator, config: TrackConfig) -> Predictor:
