@@ -27,6 +27,7 @@ def test_a_terminal_shows_text_and_counts_on_standard_error(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO", "posekit")  # as the commands have it without --quiet
+    monkeypatch.setenv("TERM", "xterm")  # rich shows no bar on a dumb terminal
     monkeypatch.setattr(rich.console.Console, "is_terminal", True)
     with messages(quiet=False, verbose=False), progress_bar("count", "text") as update:
         update(completed=2, total=7, description="frames")
