@@ -23,7 +23,6 @@ from posekit.results import (
     Estimate,
     Source,
     Step,
-    estimate_to_json,
     estimates_from_json,
     estimates_to_json,
 )
@@ -63,7 +62,7 @@ def test_a_verdict_needs_both_score_and_angle(angle_deg: float, score: float, wo
     assert found.reliable == words.startswith("reliable")
     assert found.verdict.startswith(words)
     assert found.angle_deg == pytest.approx(angle_deg, nan_ok=True)
-    assert json.loads(estimate_to_json(found))["estimates"][0]["reliable"] is found.reliable
+    assert json.loads(estimates_to_json([found]))["estimates"][0]["reliable"] is found.reliable
 
 
 def test_a_source_says_who_vouches_for_a_detection() -> None:
@@ -86,7 +85,7 @@ def no_constant(name: str) -> float:
 
 def test_the_result_has_what_the_readme_promises() -> None:
     data = json.loads(
-        estimate_to_json(estimate(), weights_hash="abc", versions={"torch": "2"}), parse_constant=no_constant
+        estimates_to_json([estimate()], weights_hash="abc", versions={"torch": "2"}), parse_constant=no_constant
     )
     [entry] = data["estimates"]
     np.testing.assert_allclose(entry["T_cam_obj"], POSE.matrix)
@@ -117,9 +116,9 @@ def test_round_trip() -> None:
 
 def test_alternatives_are_kept() -> None:
     found = replace(estimate(), alternatives=(estimate(0.3), replace(estimate(0.4), score=0.1)))
-    [back] = estimates_from_json(estimate_to_json(found))
+    [back] = estimates_from_json(estimates_to_json([found]))
     assert [(e.angle, e.score) for e in back.alternatives] == [pytest.approx((0.3, 0.8)), pytest.approx((0.4, 0.1))]
-    entry = json.loads(estimate_to_json(found))["estimates"][0]
+    entry = json.loads(estimates_to_json([found]))["estimates"][0]
     assert [e["reliable"] for e in entry["alternatives"]] == [False, False]
     del entry["alternatives"]
     [old] = estimates_from_json(json.dumps({"estimates": [entry]}))
@@ -127,7 +126,7 @@ def test_alternatives_are_kept() -> None:
 
 
 def test_what_is_not_finite_is_null() -> None:
-    text = estimate_to_json(estimate(float("nan")), about={"loss": np.float32("inf")})
+    text = estimates_to_json([estimate(float("nan"))], about={"loss": np.float32("inf")})
     data = json.loads(text, parse_constant=no_constant)
     assert data["estimates"][0]["angle_deg"] is None
     assert data["loss"] is None
@@ -148,7 +147,7 @@ def test_other_json_is_refused(text: str) -> None:
     [
         {"T_cam_obj": POSE.matrix.tolist()},
         {"cam_R_m2c": POSE.R.ravel().tolist(), "cam_t_m2c": (POSE.t * 1000).tolist(), "obj_id": 9},
-        json.loads(estimate_to_json(estimate())),
+        json.loads(estimates_to_json([estimate()])),
     ],
     ids=["matrix", "bop", "result"],
 )

@@ -182,17 +182,6 @@ def check_schema(document: Any, label: str = "the file") -> None:
         )
 
 
-def estimate_to_json(
-    estimate: Estimate,
-    *,
-    weights_hash: str | None = None,
-    versions: Mapping[str, str] | None = None,
-    about: Mapping[str, Any] | None = None,
-) -> str:
-    """`estimates_to_json` of one."""
-    return estimates_to_json([estimate], weights_hash=weights_hash, versions=versions, about=about)
-
-
 def estimates_from_json(text: str) -> list[Estimate]:
     """What `estimates_to_json` wrote, also that of posekit 0.1; masks are not in the file. Raises PromptError where it
     is something else, or of a newer posekit."""

@@ -142,8 +142,8 @@ class PoseEstimator:
         return self.runtime.networks
 
     def estimate(self, view: View, detections: Sequence[Detection], min_score: float = 0.0) -> list[Estimate]:
-        """One estimate for each detection that gives a silhouette to start from, in their order. least: the score that
-        is asked for; what has not half of it after a few iterations is not refined to the end."""
+        """One estimate for each detection that gives a silhouette to start from, in their order. min_score: the score
+        that is needed; a pose with less than half of it after a few iterations is not refined to the end."""
         estimates = []
         for detection in detections:
             started = time.perf_counter()
@@ -180,8 +180,8 @@ class PoseEstimator:
         hull, update = self.model.hull_ctr, self.refine_options.update
         compared = zip(poses, *compare(view, self.model, hull, poses, self.predictor, self.renderer), strict=True)
         updated = [update_pose(T, self.model, p, o, d, update) or T for T, p, o, d in compared]
-        looks = zip(*compare(view, self.model, hull, updated, self.predictor, self.renderer), strict=True)
-        for (k, hypothesis), (prediction, observed, rendered) in zip(found, looks, strict=True):
+        compared_again = zip(*compare(view, self.model, hull, updated, self.predictor, self.renderer), strict=True)
+        for (k, hypothesis), (prediction, observed, rendered) in zip(found, compared_again, strict=True):
             exists = _existence(prediction, observed, rendered, prediction.angle)
             odds = np.log(max(exists, 1e-6) / max(1 - exists, 1e-6)) + SCREENED_EVIDENCE * hypothesis.score
             scores[k] = max(scores[k], odds)

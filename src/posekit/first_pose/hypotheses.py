@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from posekit.camera import Box, Camera
+from posekit.camera import Box, Camera, box_mask
 from posekit.errors import PromptError
 from posekit.first_pose.evidence import Palette, Picture, Silhouettes, Weights
 from posekit.geometry import (
@@ -160,7 +160,7 @@ class TemplateSearch:
         view: the photograph. detection: its box and, better, its mask; without a mask the filled box is compared.
         """
         zoom = zoom_to_box(view.camera, detection.box, (128, 128), enlarge=1.15)
-        mask = detection.mask if detection.mask is not None else box_mask(detection.box, view.camera)
+        mask = detection.mask if detection.mask is not None else box_mask(detection.box, view.camera.size)
         crop = view.with_mask(mask).zoomed(zoom)
         if crop.mask is None or not crop.mask.any():
             return []
@@ -476,14 +476,6 @@ def weights_for(model: ObjectModel, weights: Weights) -> Weights:
     """Without the colour agreement for a mesh without colours: its shading depends on a light that nobody knows."""
     plain = model.colors is None and model.texture is None
     return replace(weights, agreement=0.0) if plain else weights
-
-
-def box_mask(box: tuple[float, float, float, float], camera: Camera) -> NDArray[np.bool_]:
-    """The filled box as a mask (H, W)."""
-    mask = np.zeros((camera.height, camera.width), bool)
-    x0, y0, x1, y1 = (round(v) for v in box)
-    mask[max(0, y0) : max(0, y1), max(0, x0) : max(0, x1)] = True
-    return mask
 
 
 def _u8(mask: NDArray[np.bool_] | None) -> NDArray[np.uint8]:

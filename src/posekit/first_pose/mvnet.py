@@ -11,9 +11,9 @@ import torch
 from numpy.typing import NDArray
 
 from posekit.align.pnp import PnpConfig, solve_pnp
-from posekit.camera import Camera, Zoom
+from posekit.camera import Camera, Zoom, box_mask
 from posekit.errors import WeightsError
-from posekit.first_pose.hypotheses import FirstPoseSearch, Hypothesis, box_mask
+from posekit.first_pose.hypotheses import FirstPoseSearch, Hypothesis
 from posekit.first_pose.view_bank import DISTANCE, TURNS, ViewBank
 from posekit.geometry import Pose, cube_views, quat_to_rotation, rotation_angle, rotation_between, so3_exp
 from posekit.mesh.model import ObjectModel
@@ -118,7 +118,7 @@ class MVNetSearch:
 
     def search(self, view: View, detection: Detection, count: int) -> list[Hypothesis]:
         """One first pose; ``count`` is an upper bound, as for every search. Empty where it lies behind the camera."""
-        mask = detection.mask if detection.mask is not None else box_mask(detection.box, view.camera)
+        mask = detection.mask if detection.mask is not None else box_mask(detection.box, view.camera.size)
         crop = view.with_mask(mask).zoomed(zoom_to_box(view.camera, detection.box, self.size))
         observed = torch.from_numpy(to_input(crop.image, crop.mask))[None].to(self.device)
         with torch.inference_mode():
