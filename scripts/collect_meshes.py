@@ -109,7 +109,7 @@ def main() -> None:
     parser.add_argument("--shapes", type=Path, help="pybullet's wheel")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--largest-kb", type=int, default=3000, help="of a mesh with its textures")
-    parser.add_argument("--max-detections-shapes", type=int, default=200)
+    parser.add_argument("--max-shapes", type=int, default=200)
     args = parser.parse_args()
     if args.out.exists() and any(args.out.iterdir()):
         parser.error(f"{args.out} holds files: name another folder")
@@ -119,7 +119,7 @@ def main() -> None:
     for path, stem in archives:
         with zipfile.ZipFile(path) as archive:
             found = list(furniture(archive, stem) if stem else shapes(archive))
-            found = found if stem else found[: args.most_shapes]
+            found = found if stem else found[: args.max_shapes]
             for source in track(found, description=path.name):
                 if unpack(archive, source, args.out, 1000 * args.largest_kb):
                     lines.append(f"| {source.name} | {source.author} | {source.licence} | {path.name} |")

@@ -9,12 +9,15 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import trimesh
+from scipy.spatial import cKDTree
 
 from objects import bracket
 from posekit.geometry import quat_to_rotation, rotation_angle
+from posekit.mesh.model import ObjectModel
 from posekit.nets.pose_delta import apply_delta
 from posekit.render import Light, Renderer
-from posekit.synth.appearance import KINDS, variants, washed_out
+from posekit.synth.appearance import KINDS, scanned, variants, washed_out
 from posekit.synth.procedural import random_object, random_texture
 from posekit.train.data.augment import AugmentConfig, augment, composed, disturb_mask, observe
 from posekit.train.data.crops import Frontal, SceneConfig, box_sample, render_scenes
@@ -25,7 +28,7 @@ from posekit.zoom import frontal_pose
 
 @pytest.fixture(scope="module")
 def pairs() -> list[Pair]:
-    return render_pairs(Renderer(), bracket(), 40, PairConfig(unlike=0, deformed=0), np.random.default_rng(0))
+    return render_pairs(Renderer(), bracket(), 40, PairConfig(unlike=0, deformed=0, scans=0), np.random.default_rng(0))
 
 
 def test_the_flow_leads_to_the_same_paint(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -34,7 +37,9 @@ def test_the_flow_leads_to_the_same_paint(monkeypatch: pytest.MonkeyPatch) -> No
         "posekit.train.data.pairs.random_light", lambda rng: Light(ambient=0.9, diffuse=0.1, specular=0.0)
     )
     hues = []
-    for pair in render_pairs(Renderer(), bracket(), 30, PairConfig(unlike=0, deformed=0), np.random.default_rng(0)):
+    for pair in render_pairs(
+        Renderer(), bracket(), 30, PairConfig(unlike=0, deformed=0, scans=0), np.random.default_rng(0)
+    ):
         if pair.lost:
             continue
         rows, columns = np.nonzero(pair.seen)
@@ -119,6 +124,29 @@ def test_variants_look_unlike_and_stay_near_each_other() -> None:
     assert observed is model
     moved = np.linalg.norm(rendered.vertices - model.vertices, axis=1).max() / model.diameter
     assert 0.0005 < moved < 0.01
+
+
+def test_a_scan_has_the_shape_within_two_percent_and_colours_at_its_vertices() -> None:
+    rng = np.random.default_rng(3)
+    for model in (bracket(), *(random_object(rng) for _ in range(6))):
+        for _ in range(4):
+            scan = scanned(model, rng)
+            assert scan.texture is None and scan.uvs is None
+            assert (scan.colors is None) == (model.colors is None and model.texture is None)
+            assert not np.array_equal(scan.vertices, model.vertices)
+            assert np.isfinite(scan.normals).all() and len(scan.normals) == len(scan.vertices)
+            apart = cKDTree(model.vertices).query(scan.vertices)[0] / model.diameter
+            assert np.median(apart) < 0.04  # vertices of the subdivided faces included
+
+
+def test_a_scan_of_a_fine_mesh_stays_near_its_surface() -> None:
+    rng = np.random.default_rng(5)
+    sphere = trimesh.creation.icosphere(subdivisions=4, radius=0.05)
+    ball = ObjectModel.from_arrays(sphere.vertices, sphere.faces, name="ball")
+    off = [abs(np.linalg.norm(scanned(ball, rng).vertices, axis=1) - 0.05) / ball.diameter for _ in range(12)]
+    assert all(0.0003 < np.median(each) < 0.02 for each in off)
+    assert max(each.max() for each in off) > 0.02  # a missing or flat bottom is among them
+    assert all(np.quantile(each, 0.8) < 0.03 for each in off)
 
 
 @pytest.mark.parametrize(

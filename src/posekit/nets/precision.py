@@ -54,14 +54,14 @@ def threads() -> int | None:
 
 
 def has_fast_bfloat16(device: str) -> bool:
-    """Whether the hardware multiplies in bfloat16: GPUs of the last years, CPUs with AMX. On other CPUs it would be
-    several times slower than float32."""
+    """Whether the hardware multiplies in bfloat16: GPUs of the last years, CPUs with AMX or AVX-512's instructions for
+    it. On other CPUs it would be several times slower than float32."""
     import torch
 
     if device == "cuda":
         return torch.cuda.is_bf16_supported()
     ask: Any = getattr(torch.cpu, "get_capabilities", dict)  # older versions of torch do not have it
-    return bool(ask().get("amx_bf16"))
+    return any(ask().get(name) for name in ("amx_bf16", "avx512_bf16"))
 
 
 def usable_cores() -> int:

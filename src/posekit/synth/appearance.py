@@ -11,9 +11,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
 from posekit.mesh.model import ObjectModel
+from posekit.mesh.processing import coincident, smooth_normals
 from posekit.synth.procedural import random_colour, random_texture
 
 Image = NDArray[np.uint8]
@@ -22,16 +24,18 @@ Rng = np.random.Generator
 WASHED_OUT = ("plain", "one colour", "washed out", "vertex colours")  # what `washed_out` makes
 KINDS = (*WASHED_OUT, "other paint")
 SHARES = (0.4, 0.12, 0.12, 0.16, 0.2)
+SCAN_EDGE, SCAN_FACES = 1 / 20, 12_000  # `scanned`: longest mean edge in diameters, most faces after subdivision
 
 
 def variants(
-    model: ObjectModel, photos: Sequence[Image], share: float, deformed: float, rng: Rng
+    model: ObjectModel, photos: Sequence[Image], share: float, deformed: float, rng: Rng, scans: float = 0.0
 ) -> tuple[ObjectModel, ObjectModel]:
     """The mesh that is rendered and the one that is observed; in ``1 - share`` of the cases they look the same.
 
     The rendered one is plain grey, of one colour, washed out or has the texture's colours at its vertices only, or the
     observed one has another paint; in a tenth of these cases the two are exchanged. deformed: the share of rendered
-    meshes whose surface is deformed smoothly by up to 0.5 % of the diameter. photos: to cut textures from.
+    meshes whose surface is deformed smoothly by up to 0.5 % of the diameter. scans: the share of rendered meshes that
+    are a scan of the observed one, see `scanned`. photos: to cut textures from.
     """
     rendered = observed = model
     if rng.random() < share:
@@ -46,8 +50,11 @@ def variants(
                 observed = painted(model, photos, rng)
         if rng.random() < 0.1:
             rendered, observed = observed, rendered
-    if rng.random() < deformed:
+    drawn = rng.random()
+    if drawn < deformed:
         rendered = deformed_mesh(rendered, rng)
+    elif drawn < deformed + scans:
+        rendered = scanned(rendered, rng)
     return rendered, observed
 
 
@@ -93,3 +100,84 @@ def deformed_mesh(model: ObjectModel, rng: Rng) -> ObjectModel:
     points = model.vertices.astype(np.float64) / model.diameter
     waves = np.sin(points @ (rng.normal(size=(3, 3)) * 8.0) + rng.uniform(0, 6, size=3))
     return replace(model, vertices=(model.vertices + 0.005 * model.diameter * waves).astype(np.float32))
+
+
+def scanned(model: ObjectModel, rng: Rng) -> ObjectModel:
+    """The mesh as a scan with a depth camera shows it.
+
+    Edges are rounded, the surface is wavy by up to about 1 % of the diameter, the size is up to 1 % wrong, the colours
+    are those of vertices, blurred and with the light of the scan in them; and what lay below may be flat or missing.
+    """
+    points, faces, colours = _fine(model)
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    for _ in range(int(rng.integers(0, 4))):
+        points = _averaged(points, edges)
+    for frequency in (8.0, 25.0):
+        waves = np.sin(points / model.diameter @ (rng.normal(size=(3, 3)) * frequency) + rng.uniform(0, 6, size=3))
+        points = points + model.diameter * np.exp(rng.uniform(np.log(0.0005), np.log(0.006))) * waves
+    points = model.center + (points - model.center) * (1 + rng.uniform(-0.01, 0.01))
+    if rng.random() < 0.35:
+        points, faces = _without_bottom(points, faces, rng)
+    sources, faces, normals = smooth_normals(points, faces)
+    paint = None
+    if colours is not None:
+        for _ in range(int(rng.integers(0, 3))):
+            colours = _averaged(colours, edges)
+        colours = colours[sources]
+        toward = rng.normal(size=3)
+        light = np.clip(normals @ (toward / np.linalg.norm(toward)), 0, 1)
+        colours = colours * (1 + rng.uniform(0, 0.5) * (light[:, None] - 0.5)) * rng.uniform(0.7, 1.15)
+        paint = np.clip(colours, 0, 255).astype(np.uint8)
+    return replace(
+        model, vertices=points[sources].astype(np.float32), faces=faces.astype(np.int32),
+        normals=normals.astype(np.float32), colors=paint, uvs=None, texture=None,
+    )  # fmt: skip
+
+
+def _fine(model: ObjectModel) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64] | None]:
+    """Vertices (V, 3), faces (F, 3) and colours (V, 3), or None, of the mesh with each place once and short edges."""
+    painted = model.texture is not None or model.colors is not None
+    attributes = {"uv": model.uvs} if model.uvs is not None else {}
+    if model.colors is not None:
+        attributes["colour"] = model.colors.astype(np.float32)
+    vertices, faces = model.vertices, model.faces
+    while len(faces) * 4 <= SCAN_FACES and _mean_edge(vertices, faces) > SCAN_EDGE * model.diameter:
+        vertices, faces, attributes = trimesh.remesh.subdivide(vertices, faces, vertex_attributes=attributes)  # type: ignore[no-untyped-call]
+    split = replace(
+        model, vertices=vertices, faces=faces, uvs=attributes.get("uv"),
+        colors=attributes["colour"].astype(np.uint8) if "colour" in attributes else None,
+    )  # fmt: skip
+    places = coincident(vertices.astype(np.float64))
+    _, first, place = np.unique(places, return_index=True, return_inverse=True)
+    colours = vertex_colours(split)[first].astype(np.float64) if painted else None
+    joined = place[faces].astype(np.int64)
+    whole = (joined[:, 0] != joined[:, 1]) & (joined[:, 1] != joined[:, 2]) & (joined[:, 2] != joined[:, 0])
+    return vertices[first].astype(np.float64), joined[whole], colours
+
+
+def _mean_edge(vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> float:
+    return float(np.linalg.norm(vertices[faces[:, 0]] - vertices[faces[:, 1]], axis=1).mean())
+
+
+def _averaged(values: NDArray[np.float64], edges: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Each vertex's values (V, C) halfway to the mean of its neighbours'."""
+    count = np.bincount(edges.ravel(), minlength=len(values))[:, None]
+    total = np.zeros_like(values)
+    for a, b in (edges.T, edges.T[::-1]):
+        for c in range(values.shape[1]):
+            total[:, c] += np.bincount(a, weights=values[b, c], minlength=len(values))
+    return np.where(count > 0, 0.5 * values + 0.5 * total / np.maximum(count, 1), values)
+
+
+def _without_bottom(
+    points: NDArray[np.float64], faces: NDArray[np.int64], rng: Rng
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """What lies beyond a plane near one end is laid flat onto it, or left out."""
+    axis = rng.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    height = points @ axis
+    level = height.min() + rng.uniform(0.01, 0.08) * np.ptp(height)
+    if rng.random() < 0.5:
+        return points + np.maximum(level - height, 0)[:, None] * axis, faces
+    kept = (height[faces] >= level).any(1)
+    return (points, faces[kept]) if kept.any() else (points, faces)

@@ -49,8 +49,8 @@ class Case:
 
 @dataclass(frozen=True, eq=False)
 class CaseSource:
-    """What renderings for cases are made of. models: in turn; none = new procedural objects. unlike, deformed: the
-    shares of cases whose mesh has other colours than the object that is shown, or another shape
+    """What renderings for cases are made of. models: in turn; none = new procedural objects. unlike, deformed,
+    scans: the shares of cases whose mesh has other colours than the object that is shown, or another shape
     (`appearance.variants`)."""
 
     models: Sequence[ObjectModel]
@@ -59,6 +59,7 @@ class CaseSource:
     augment: AugmentConfig
     unlike: float = 0.0
     deformed: float = 0.0
+    scans: float = 0.0
 
 
 def rendered_cases(source: CaseSource, renderer: Renderer, count: int, seed: int = HELD_BACK) -> list[Case]:
@@ -69,7 +70,7 @@ def rendered_cases(source: CaseSource, renderer: Renderer, count: int, seed: int
     others: list[NDArray[np.uint8]] = []
     while len(cases) < count:
         model = models[len(cases) % len(models)] if models else random_object(rng, photos)
-        known, shown = variants(model, photos, source.unlike, source.deformed, rng)
+        known, shown = variants(model, photos, source.unlike, source.deformed, rng, source.scans)
         for scene in render_scenes(renderer, shown, 1, config, rng):
             picture, _ = observe(scene.rgba, others, photos, replace(augment, no_mask=0.0), rng)
             others.append(scene.rgba)

@@ -123,7 +123,13 @@ def _calibrate(
     networks, renderer, stream = load_networks(preset, weights), Renderer(), config.stream
     models = sources.models or [m for data, _ in sources.bop for m in map(data.model, data.model_ids())]
     source = CaseSource(
-        models, sources.photos, stream.scenes, stream.augment, stream.pairs.unlike, stream.pairs.deformed
+        models,
+        sources.photos,
+        stream.scenes,
+        stream.augment,
+        stream.pairs.unlike,
+        stream.pairs.deformed,
+        stream.pairs.scans,
     )
     given = round(config.calibrate * (stream.share if models else 0.0))
     cases = rendered_cases(source, renderer, given, SEED) if given else []

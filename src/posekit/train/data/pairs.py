@@ -42,9 +42,10 @@ class PairConfig:
     lost: float = 0.12
     flipped: float = 0.5  # of the lost ones, those turned by about half a turn, whose outline is often right
     enlarge: tuple[float, float] = (1.25, 1.6)
-    # unlike, deformed: see `appearance.variants`
+    # unlike, deformed, scans: see `appearance.variants`
     unlike: float = 0.35
     deformed: float = 0.15
+    scans: float = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +115,7 @@ def render_pairs(
     photos: Sequence[NDArray[np.uint8]] = (),
 ) -> list[Pair]:
     """``count`` pairs of one object, drawn in two batches. photos: to cut other paint from."""
-    rendered, observed = variants(model, photos, config.unlike, config.deformed, rng)
+    rendered, observed = variants(model, photos, config.unlike, config.deformed, rng, config.scans)
     outline = model.hull_ctr
     T_ctr_obj = model.T_ctr_obj
     sources, targets, cameras, lost = [], [], [], []
