@@ -8,12 +8,15 @@ import shutil
 import subprocess
 import sys
 import tomllib
+import zipfile
 from pathlib import Path
 
 import pytest
 
+from posekit.mesh.model import ObjectModel
+
 ROOT = Path(__file__).resolve().parent.parent
-SCRIPTS = [ROOT / "scripts" / name for name in ("setup", "demo", "test", "check", "pictures", "docs")] + [
+SCRIPTS = [ROOT / "scripts" / name for name in ("setup", "demo", "test", "check", "pictures", "docs", "meshes")] + [
     ROOT / ".ci" / "run"
 ]
 
@@ -115,3 +118,27 @@ def test_constraints_lie_within_the_ranges() -> None:
     pinned = [line for line in (ROOT / "scripts/constraints.txt").read_text().splitlines() if "==" in line]
     assert {line.split("==")[0] for line in pinned} >= {"torch", "torchvision", "viser", "mkdocs-material"}
     assert not any("==" in dependency for dependency in project["dependencies"])
+
+
+def test_openly_licensed_meshes_are_collected(tmp_path: Path) -> None:
+    cube = "\n".join(f"v {x} {y} {z}" for x in (0, 1) for y in (0, 1) for z in (0, 2))
+    faces = "f 1 2 4 3\nf 5 7 8 6\nf 1 5 6 2\nf 3 4 8 7\nf 1 3 7 5\nf 2 6 8 4\n"
+    wheel, catalogues = tmp_path / "shapes.whl", tmp_path / "furniture"
+    with zipfile.ZipFile(wheel, "w") as archive:
+        for k in range(3):
+            archive.writestr(f"pybullet_data/random_urdfs/{k:03}/{k:03}.obj", f"{cube}\n{faces}")
+            archive.writestr(f"pybullet_data/random_urdfs/{k:03}/{k:03}.mtl", "newmtl a\n")
+    catalogues.mkdir()
+    listed = "license=CC-BY 3.0\nmodel#1=/m/box.obj\ncreator#1=A. Maker\nwidth#1=30\ndepth#1=40\nheight#1=120\n"
+    for name, text in (("free", listed), ("closed", listed.replace("CC-BY", "CC-BY-NC"))):
+        with zipfile.ZipFile(catalogues / f"{name}.sh3f", "w") as archive:
+            archive.writestr("PluginFurnitureCatalog.properties", text)
+            archive.writestr("m/box.obj", f"{cube}\n{faces}")
+    command = ["--furniture", catalogues, "--shapes", wheel, "--out", tmp_path / "out", "--max-shapes", "2"]
+    done = subprocess.run(
+        [sys.executable, ROOT / "scripts/collect_meshes.py", *command], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert "3 meshes" in done.stdout and "closed: left out" in done.stderr
+    assert ObjectModel.load(tmp_path / "out/free_box/box.obj", units="m").diameter == pytest.approx(1.3, rel=1e-3)
+    assert "| free_box | A. Maker | CC-BY 3.0 | free.sh3f |" in (tmp_path / "out/LICENCES.md").read_text()
