@@ -107,7 +107,7 @@ def collect(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     models = {k: data.model(k) for k in data.model_ids()}
     given = {k: scanned(m, rng) if args.scans else m for k, m in models.items()}
     estimators, pictures = Estimators(), data.images()
-    detector, _ = make_detector("novel", list(given.values())) if args.proposals else (None, None)
+    detector, _ = make_detector("novel", list(given.values()), doubtful=True) if args.proposals else (None, None)
     chosen = np.linspace(0, len(pictures) - 1, min(args.images, len(pictures))).astype(int)
     for k in np.unique(chosen):
         view, instances = data.view(*pictures[k]), data.instances(*pictures[k], every=True)

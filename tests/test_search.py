@@ -186,6 +186,19 @@ def test_what_is_kept_depends_on_who_says_where_the_object_is() -> None:
     assert SearchOptions.usual([Detection(BOXES[0]), Detection(BOXES[1], source=Source.TRAINED)]).min_score == 0.5
 
 
+def test_the_search_ends_with_as_many_sure_instances_as_are_wanted() -> None:
+    def asked(scores: Sequence[float], source: Source = Source.NOVEL, **options: Any) -> int:
+        fixed = Fixed(scores)
+        kept(fixed, source, SearchOptions(candidates=4, **options))
+        return len(fixed.asked)
+
+    assert asked([0.96, 0.97, 0.99, 0.5]) == 1
+    assert asked([0.9, 0.5, 0.96, 0.5]) == 3
+    assert asked([0.96, 0.97, 0.99, 0.5], instances=2) == 3, "the second lies on the first"
+    assert asked([0.96, 0.97, 0.99, 0.5], instances=0) == asked([0.96] * 4, Source.BOX) == 4
+    assert asked([0.96, 0.97, 0.99, 0.5], sure=0.98) == 3
+
+
 def test_a_detection_belongs_to_the_model_of_its_label() -> None:
     models, fixed = [bracket(), brick()], Fixed([0.6, 0.8, 0.7])
     labels = ["brick", "bracket", None]

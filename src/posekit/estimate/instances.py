@@ -43,11 +43,18 @@ class SearchOptions:
     min_score: float = 0.5  # score of an estimate below which it is no instance
     overlap: float = 0.5  # of the boxes (intersection over union) from which two estimates are of one instance
     candidates: int = 3  # the novel detector's detections that are estimated, the most promising ones
+    sure: float = 0.95  # score from which an estimate is an instance whatever the remaining detections would give
 
     def __post_init__(self) -> None:
-        if self.instances < 0 or self.candidates < 1 or not 0 <= self.min_score <= 1 or not 0 < self.overlap <= 1:
+        shares = (self.min_score, self.sure)
+        if (
+            self.instances < 0
+            or self.candidates < 1
+            or not 0 < self.overlap <= 1
+            or not all(0 <= s <= 1 for s in shares)
+        ):
             raise ConfigError(
-                "instances is not negative, candidates at least 1, min_score in [0, 1] and overlap in (0, 1]."
+                "instances is not negative, candidates at least 1, min_score and sure in [0, 1], overlap in (0, 1]."
             )
 
     @classmethod
@@ -111,16 +118,24 @@ def promising(
 def estimates_of(
     estimator: Estimator, view: View, detections: Sequence[Detection], options: SearchOptions
 ) -> list[Estimate]:
-    """An estimate for each detection that leads to one, in their order. What the novel detector found is scored by
+    """An estimate for each detection that leads to one, in their order, until as many sure instances are found as are
+    wanted; detections by hand are all estimated. What the novel detector found is scored by
     how much it looks like the mesh as well: a logistic function's argument grows by `WEIGHT` times what the similarity
     is above `USUAL` (docs/decisions/0015)."""
-    found = []
+    found: list[Estimate] = []
     for detection in detections:
+        if not detection.source.by_hand and _enough(found, options):
+            break
         shift = WEIGHT * (detection.score - USUAL) if detection.source is Source.NOVEL else 0.0
         for estimate in estimator.estimate(view, [detection], shifted(options.min_score, -shift)):
             others = tuple(replace(e, score=shifted(e.score, shift)) for e in estimate.alternatives)
             found.append(replace(estimate, score=shifted(estimate.score, shift), alternatives=others))
     return found
+
+
+def _enough(estimates: Sequence[Estimate], options: SearchOptions) -> bool:
+    sure = instances_of([each for each in estimates if each.score >= options.sure], replace(options, instances=0))
+    return 0 < options.instances <= len(sure)
 
 
 def instances_of(estimates: Sequence[Estimate], options: SearchOptions) -> list[Estimate]:
