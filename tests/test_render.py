@@ -521,3 +521,25 @@ raise SystemExit(os.wait()[1])
     assert done.returncode == 0, done.stderr
     first, second = done.stdout.splitlines()
     assert first == second != ""
+
+
+def test_triton_is_loaded_before_opengl_starts(tmp_path, monkeypatch) -> None:
+    library = tmp_path / "triton/_C/libtriton.so"
+    library.parent.mkdir(parents=True)
+    library.touch()
+    (tmp_path / "triton/__init__.py").touch()
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "triton", raising=False)
+    order: list[str] = []
+    monkeypatch.setattr(context.ctypes, "CDLL", order.append)
+
+    def refuse() -> None:
+        order.append("OpenGL")
+        raise RenderError("none here")
+
+    monkeypatch.setattr(context, "_context", None)
+    for way in ("_create_egl", "_create_standalone", "_create_osmesa"):
+        monkeypatch.setattr(context, way, refuse)
+    with pytest.raises(RenderError):
+        info()
+    assert order[:2] == [str(library), "OpenGL"]

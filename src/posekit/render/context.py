@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import ctypes
 import importlib.metadata
+import importlib.util
 import os
 import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from ctypes.util import find_library
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,6 +76,7 @@ def _get(backend: str) -> Context:
     global _context
     wanted = _wanted(backend)
     if _context is None:
+        _load_triton()
         gl, name = _create(wanted)
         gl.gc_mode = "context_gc"  # objects die in whatever thread drops them; GL frees them in `current`
         _context = Context(gl, name, os.getpid())
@@ -94,6 +96,16 @@ def _refuse_fork() -> None:
             "drivers do not survive a fork. Start workers with multiprocessing's 'spawn' or 'forkserver' method, "
             "or fork them before the first rendering."
         )
+
+
+def _load_triton() -> None:
+    """The library of triton, of torch's builds for NVIDIA GPUs, before Mesa's: both hold LLVM, and loaded the other way
+    round, as torch and torchvision do while they read networks, triton ends the process by a segmentation fault."""
+    found = importlib.util.find_spec("triton")
+    for folder in (found.submodule_search_locations or ()) if found is not None else ():
+        for library in Path(folder, "_C").glob("libtriton*.so"):
+            with suppress(OSError):  # unusable here, and then nothing else loads it either
+                ctypes.CDLL(str(library))
 
 
 def _wanted(backend: str) -> str:
