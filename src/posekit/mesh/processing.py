@@ -165,6 +165,16 @@ def carried_uvs(
     return np.concatenate(source), index.reshape(-1, 3), np.concatenate(means)
 
 
+def subdivided(
+    vertices: NDArray[np.float32], faces: NDArray[np.int32], attributes: dict[str, NDArray[np.float32]]
+) -> tuple[NDArray[np.float32], NDArray[np.int32], dict[str, NDArray[np.float32]]]:
+    """Each triangle as four. vertices: (V, 3). faces: (F, 3). attributes: (V, C) each, interpolated along the edges."""
+    import trimesh.remesh
+
+    points, triangles, values = trimesh.remesh.subdivide(vertices, faces, vertex_attributes=attributes)  # type: ignore[no-untyped-call]
+    return points.astype(np.float32), triangles.astype(np.int32), values
+
+
 def convex_hull(points: Floats) -> Floats:
     """The corners (N, 3) of the convex hull of points (V, 3), flat ones too."""
     middle = points.mean(axis=0)

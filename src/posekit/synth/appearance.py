@@ -11,11 +11,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from posekit.mesh.model import ObjectModel
-from posekit.mesh.processing import coincident, smooth_normals
+from posekit.mesh.processing import coincident, smooth_normals, subdivided
 from posekit.synth.procedural import random_colour, random_texture
 
 Image = NDArray[np.uint8]
@@ -142,7 +141,7 @@ def _fine(model: ObjectModel) -> tuple[NDArray[np.float64], NDArray[np.int64], N
         attributes["colour"] = model.colors.astype(np.float32)
     vertices, faces = model.vertices, model.faces
     while len(faces) * 4 <= SCAN_FACES and _mean_edge(vertices, faces) > SCAN_EDGE * model.diameter:
-        vertices, faces, attributes = trimesh.remesh.subdivide(vertices, faces, vertex_attributes=attributes)  # type: ignore[no-untyped-call]
+        vertices, faces, attributes = subdivided(vertices, faces, attributes)
     split = replace(
         model, vertices=vertices, faces=faces, uvs=attributes.get("uv"),
         colors=attributes["colour"].astype(np.uint8) if "colour" in attributes else None,
