@@ -5,7 +5,7 @@ All four variants of a sequence show the same motion of the same object before t
 - regular: the light stands still with the camera, and nothing is added;
 - light: the light goes round the object, and its highlights and shades with it;
 - noise: the moving light, and Gaussian noise on every pixel;
-- occlusion: the moving light, and a second object of the data set that goes round the first and passes before it.
+- occlusion: the moving light, and a second object of the data set that swings before the first and hides parts of it.
 
 As in RBOT's renderings there is no motion blur. The photograph is on a wall behind, seen by a camera in somebody's
 hand. Poses are relative to the camera, and the second object is annotated too.
@@ -37,7 +37,8 @@ TURN_STEP, SHIFT_STEP = math.radians(6.0), 0.08  # from frame to frame, in the m
 TURN = 1.5  # radians, of the path's sines: the object is seen from all sides in the course of time
 DISTANCE, MIDDLE = (3.0, 6.0), (0.3, 0.7)  # diameters; of the picture, where the object's centre stays
 NOISE = 12.0  # grey levels, standard deviation
-LIGHT_PERIOD, OCCLUDER_PERIOD = (2.0, 4.0), (2.0, 3.5)  # seconds for a turn
+LIGHT_PERIOD, OCCLUDER_PERIOD = (2.0, 4.0), (2.0, 3.5)  # seconds for a turn, and for a swing there and back
+SWING = np.array([0.5, 0.25])  # of the second object, across and aside, in sums of both diameters
 WIDER = 1.6  # how much larger than the picture the photograph is
 HAND_TURN, HAND_SHIFT = 0.1, 0.08  # of the camera before the wall: radians, and shares of the wall's distance
 HAND_HERTZ = (0.1, 0.4)
@@ -101,7 +102,7 @@ class RbotSequences:
         circling = about / np.linalg.norm(about) * 2 * np.pi / seconds
         if variant == "occlusion":
             other = self._second(obj_id, rng)
-            objects.append((other, self.models[other], circling_path(model, path, self.models[other], rng)))
+            objects.append((other, self.models[other], passing_path(model, path, self.models[other], rng)))
         light = Light(ambient=0.45, diffuse=0.65, specular=0.25)
         moving, noise = variant != "regular", NOISE if variant == "noise" else 0.0
         return RbotPlan(camera, objects, light, circling if moving else None, wide, hand, noise)
@@ -168,22 +169,23 @@ def quick_path(model: ObjectModel, camera: Camera, rng: Rng) -> Path:
     return path
 
 
-def circling_path(first: ObjectModel, path: Path, second: ObjectModel, rng: Rng) -> Path:
-    """``T_cam_obj`` of a second object that goes round the first: before it, half beside it, and behind it."""
-    radius = 0.55 * (first.diameter + second.diameter)
-    aside = rng.uniform(0.15, 0.35) * (first.diameter + second.diameter) * rng.choice([-1.0, 1.0])
-    tilt, phase, period = rng.uniform(0, np.pi), rng.uniform(0, 2 * np.pi), rng.uniform(*OCCLUDER_PERIOD)
+def passing_path(first: ObjectModel, path: Path, second: ObjectModel, rng: Rng) -> Path:
+    """``T_cam_obj`` of a second object that swings before the first, from side to side, and passes it twice in a
+    period."""
+    both = first.diameter + second.diameter  # half of it keeps them from touching
+    tilt, phase, period = rng.uniform(0, np.pi), rng.uniform(0, 2 * np.pi, size=2), rng.uniform(*OCCLUDER_PERIOD)
     across = np.array([np.cos(tilt), np.sin(tilt), 0.0])
     beside = np.array([-np.sin(tilt), np.cos(tilt), 0.0])
     start, turns = random_rotation(rng), SineMotion.random(rng, 1.0, 0.0)
 
-    def circling(seconds: float) -> Pose:
-        angle = phase + 2 * np.pi * seconds / period
-        off = radius * (np.cos(angle) * across - np.sin(angle) * np.array([0.0, 0.0, 1.0])) + aside * beside
+    def passing(seconds: float) -> Pose:
+        angle = 2 * np.pi * seconds / period
+        wide, small = SWING * np.sin(np.array([1.0, 0.7]) * angle + phase)
+        off = both * (wide * across + small * beside - np.array([0.0, 0.0, 0.55]))
         R = turns(seconds).R @ start
         return Pose(R, path(seconds).apply(first.center) + off - R @ second.center)
 
-    return circling
+    return passing
 
 
 def behind(wide: NDArray[np.uint8], camera: Camera, T_cam_wall: Pose) -> NDArray[np.uint8]:
