@@ -116,6 +116,20 @@ def evaluate(
             rich_help_panel=STAGE,
         ),
     ] = "15,1,1,5",
+    protocol: Annotated[
+        Literal["redetect", "rbot"],
+        typer.Option(
+            help="track: redetect (a lost object is found again in its true mask) or rbot (RBOT's: reset to the true "
+            "pose after each frame that is 5 degrees or 5 cm off, nothing else told).",
+            rich_help_panel=STAGE,
+        ),
+    ] = "redetect",
+    resets: Annotated[
+        bool,
+        typer.Option(
+            "--resets/--no-resets", help="track, protocol rbot: whether wrong poses are reset.", rich_help_panel=STAGE
+        ),
+    ] = True,
     csv: Annotated[
         Path | None, typer.Option(metavar="FILE", help="score: a file of poses in BOP's format.", rich_help_panel=STAGE)
     ] = None,
@@ -203,6 +217,8 @@ def evaluate(
         masks=masks,
         noise=_noise(noise),
         seed=seed,
+        protocol=protocol,
+        resets=resets,
         preset=preset,
         weights=weights,
         estimate=EstimateOptions(
@@ -312,6 +328,8 @@ def _print_results(results: Mapping[str, Any], apart: bool) -> None:
     if seconds["median"] is not None:
         say(f"{seconds['median']:.2f} s per instance in the median, {seconds['mean']:.2f} in the mean; "
              f"weights {weights['hash']}; commit {results['commit']}; {results['machine']}")  # fmt: skip
+    if "protocol" in results:
+        _print_protocol(results["protocol"], apart)
     if data["name"] == "linemod":
         _print_paper(results, apart)
 
@@ -324,6 +342,22 @@ def _show(table: Table, apart: bool, width: int = 160) -> None:
     if not console.is_terminal:
         console = Console(stderr=apart, width=width)
     console.print(table)
+
+
+def _print_protocol(protocol: Mapping[str, Any], apart: bool) -> None:
+    from rich.table import Table
+
+    from posekit.evaluate.rbot import rows, told
+
+    variants, lines = rows(protocol)
+    table = Table(title="RBOT's protocol", title_justify="left")
+    table.add_column("object")
+    for variant in variants:
+        table.add_column(variant, justify="right")
+    for name, values in lines:
+        table.add_row(name, *("-" if v is None else f"{v:.1f}" for v in values), end_section=name == lines[-2][0])
+    _show(table, apart)
+    typer.echo(told(protocol), err=apart)
 
 
 def _print_paper(results: Mapping[str, Any], apart: bool) -> None:

@@ -90,6 +90,14 @@ def synth(
         Literal["mixed", "still", "slow", "smooth", "fast", "jerky", "hidden", "leaving"],
         typer.Option(help="sequence: how objects and camera move; mixed takes each in turn.", rich_help_panel=LOOK),
     ] = "mixed",
+    rbot: Annotated[
+        Literal["regular", "light", "noise", "occlusion", "all"] | None,
+        typer.Option(
+            help="sequence: in the manner of RBOT, one object that moves quickly; all makes the four variants of each "
+            "sequence. --images defaults to one of each object.",
+            rich_help_panel=LOOK,
+        ),
+    ] = None,
     views: Annotated[int, typer.Option(help="photoreal: views of each room.", rich_help_panel=LOOK)] = 4,
     samples: Annotated[int, typer.Option(help="photoreal: light paths for each pixel.", rich_help_panel=LOOK)] = 32,
     variant: Annotated[
@@ -125,10 +133,11 @@ def synth(
 
         check_new(out)
         objects = read_objects(given, units, symmetry)
-        count = images or (PER_OBJECT * len(objects) if kind == "randomised" else DEFAULT)
+        one_each = len(objects) * (4 if rbot == "all" else 1) * frames
+        count = images or (PER_OBJECT * len(objects) if kind == "randomised" else one_each if rbot else DEFAULT)
         config = SynthConfig(
             kind, count, seed, split, parse_size(size), quality, _text(backgrounds), _text(hdri), frames, views,
-            samples, variant, motion,
+            samples, variant, motion, rbot or "",
         )  # fmt: skip
         begin(config, out, objects)
     with progress_bar("count", "elapsed", "remaining", stage="making images") as update:

@@ -10,11 +10,12 @@ from pathlib import Path
 
 from posekit.datasets.bop import BopDataset
 from posekit.datasets.linemod import CLASSES, DeepimDataset, LinemodDataset, is_deepim
+from posekit.datasets.sequences import BcotDataset, RbotDataset, SequenceDataset, is_bcot, is_rbot
 from posekit.errors import ConfigError, InputError
 
 NAMES = "objects.json"  # of synthetic data sets: names by number
 
-Dataset = BopDataset | LinemodDataset | DeepimDataset
+Dataset = BopDataset | LinemodDataset | DeepimDataset | SequenceDataset
 
 
 @dataclass(frozen=True)
@@ -155,11 +156,13 @@ def own_names(root: Path) -> dict[int, str]:
 
 
 def open_dataset(
-    name: str | None, root: Path | None, split: str | None = None, units: str = "auto"
+    name: str | None, root: Path | None, split: str | None = None, units: str = "auto", targets: str | None = "auto"
 ) -> tuple[Dataset, DatasetInfo]:
-    """A data set by its name, its folder, or both. units: of BOP's meshes. Raises ConfigError, InputError.
+    """A data set by its name, its folder, or both. units: of the meshes. targets: as `BopDataset` takes them. Raises
+    ConfigError, InputError.
 
-    Without a name the folder's own is taken where it is a known one.
+    Without a name the folder's own is taken where it is a known one; RBOT's and BCOT's folders are known by their
+    files.
     """
     if name is None and root is None:
         raise ConfigError(
@@ -168,9 +171,11 @@ def open_dataset(
         )
     if name is None:
         assert root is not None
+        if is_rbot(root) or is_bcot(root):
+            return _sequences(root, split, units)
         known = DATASETS.get(root.resolve().name)
         if known is None or not (root / (split or known.split).partition(":")[0]).is_dir():
-            data = BopDataset(root, split or "test", units=units)
+            data = BopDataset(root, split or "test", targets, units=units)
             return data, DatasetInfo(data.name, data.name, tuple(data.model_ids()), own_names(root))
         name = known.name
     info = dataset_info(name)
@@ -181,4 +186,9 @@ def open_dataset(
         chosen = DeepimDataset(folder) if is_deepim(folder) else LinemodDataset(folder, split or info.split)
         return chosen, info
     models = info.models if (folder / info.models).is_dir() else "models"
-    return BopDataset(folder, split or info.split, models=models, units=units), info
+    return BopDataset(folder, split or info.split, targets, models=models, units=units), info
+
+
+def _sequences(root: Path, split: str | None, units: str) -> tuple[Dataset, DatasetInfo]:
+    data = RbotDataset(root, split, units) if is_rbot(root) else BcotDataset(root, split, units)
+    return data, DatasetInfo(data.name, data.name.upper(), tuple(data.model_ids()), data.object_names())

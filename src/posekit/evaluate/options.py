@@ -15,6 +15,7 @@ STAGES = ("refine", "estimate", "track", "score")
 GIVEN = ("gt-boxes", "gt-masks")  # detections that the truth gives
 DETECTOR = "detector"
 MASKS = ("true", "none")
+REDETECT, RBOT = "redetect", "rbot"  # protocols of the track stage
 NOT_RESULTS = ("workers",)  # what may differ between two runs of the same results
 
 
@@ -36,6 +37,10 @@ class EvalOptions:
     masks: str = "none"  # whether the refiner is given the visible mask ("true")
     noise: tuple[float, float, float, float] = (15.0, 1.0, 1.0, 5.0)  # degrees and three cm, standard deviations;
     seed: int = 0  # of the disturbances
+    # of track: whether a lost object's true mask stands for a detector ("redetect"), or nothing is told but the first
+    # pose and, with resets, the true pose of each frame that went wrong ("rbot")
+    protocol: str = REDETECT
+    resets: bool = True
     preset: str = "lite"
     weights: Path | None = None
     estimate: EstimateOptions = EstimateOptions()
@@ -48,6 +53,12 @@ class EvalOptions:
             raise ConfigError(f"the stage is one of {', '.join(STAGES)}, not {self.stage!r}.")
         if self.stage == "track" and (self.workers > 1 or self.limit is not None):
             raise ConfigError("tracking needs whole sequences in order: leave --workers and a number of --images out.")
+        if self.protocol not in (REDETECT, RBOT):
+            raise ConfigError(f"the protocol is {REDETECT} or {RBOT}, not {self.protocol!r}.")
+        if self.protocol == RBOT and self.stage != "track":
+            raise ConfigError(f"the protocol {RBOT} is one of tracking: pass --stage track with it, not {self.stage}.")
+        if not self.resets and self.protocol != RBOT:
+            raise ConfigError(f"resets belong to the protocol {RBOT}: pass --protocol {RBOT} with --no-resets.")
         if self.min_visible is not None and not 0 <= self.min_visible <= 1:
             raise ConfigError(f"the least visible share is between 0 and 1, not {self.min_visible:g}.")
         if self.masks not in MASKS:
@@ -64,6 +75,11 @@ class EvalOptions:
             )
 
     @property
+    def targets(self) -> str | None:
+        """Of the data set, as `BopDataset` takes them: RBOT's protocol counts all frames."""
+        return None if self.protocol == RBOT else "auto"
+
+    @property
     def true_masks(self) -> bool:
         """Whether estimates start from masks that are drawn from the annotation, which no user has."""
         return self.masks == "true" if self.stage == "refine" else self._from_truth == "gt-masks"
@@ -73,6 +89,8 @@ class EvalOptions:
         """The stage, and what it is given of the truth."""
         if self.true_masks:
             return f"{self.stage}, true masks"
+        if self.protocol == RBOT:
+            return f"{self.stage}, RBOT's protocol" + ("" if self.resets else " without resets")
         return f"{self.stage} from true boxes" if self._from_truth == "gt-boxes" else self.stage
 
     @property
@@ -92,5 +110,6 @@ class EvalOptions:
 
     def identity(self) -> dict[str, Any]:
         """What decides the results."""
-        values = {k: v for k, v in self.as_dict().items() if k not in NOT_RESULTS}
+        unused = () if self.protocol == RBOT else ("protocol", "resets")
+        values = {k: v for k, v in self.as_dict().items() if k not in (*NOT_RESULTS, *unused)}
         return values | {"root": None if self.root is None else str(self.root.resolve())}

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from posekit import metrics
 from posekit.datasets.registry import Dataset
-from posekit.evaluate import charts, table
+from posekit.evaluate import charts, rbot, table
 from posekit.evaluate.scoring import MEASURES, Case, Guess, Scored
 from posekit.geometry import Pose
 from posekit.render import Renderer
@@ -62,6 +62,7 @@ def report(results: Mapping[str, Any], scored: Scored, data: Dataset) -> str:
     body = "".join(
         [
             _head(results),
+            _section("RBOT's protocol", _protocol(results["protocol"])) if "protocol" in results else "",
             _section("Per object", _object_table(results)),
             _section("Recall against threshold", _recall(scored)),
             _section("Errors", _histograms(scored)),
@@ -96,6 +97,21 @@ def _head(results: Mapping[str, Any]) -> str:
         f"<h1>{escape(results['title'])}</h1><p class=soft>{counts['instances']} instances "
         f"({escape(data['instances'])}{escape(split)}), {counts['missing']} without an estimate.{masks} "
         f"Means over objects, percent.</p><div class=big>{big}</div>"
+    )
+
+
+def _protocol(protocol: Mapping[str, Any]) -> str:
+    variants, lines = rbot.rows(protocol)
+    head = "".join(f"<th>{escape(v)}</th>" for v in variants)
+    body = "".join(
+        f"<tr{' class=sum' if k == len(lines) - 1 else ''}><td>{escape(name)}</td>"
+        + "".join(f"<td>{_percent(v)}</td>" for v in values)
+        + "</tr>"
+        for k, (name, values) in enumerate(lines)
+    )
+    return (
+        f"<p class=soft>{escape(rbot.told(protocol))}</p>"
+        f"<div class=scroll><table><tr><th>object</th>{head}</tr>{body}</table></div>"
     )
 
 

@@ -18,7 +18,8 @@ from posekit.datasets.results_csv import ResultRow, csv_name, read_results, resu
 from posekit.detect.coco import Overlaps, average_precision_of_overlaps
 from posekit.errors import ConfigError, OutputError
 from posekit.evaluate import table
-from posekit.evaluate.options import EvalOptions
+from posekit.evaluate.options import RBOT, EvalOptions
+from posekit.evaluate.rbot import summary
 from posekit.evaluate.report import report
 from posekit.evaluate.scoring import Case, Guess, Scored, score
 from posekit.evaluate.stages import Record, Regions, detections_for
@@ -62,7 +63,7 @@ def evaluate(
     if out.exists() and not out.is_dir():
         raise OutputError(f"{out} is a file: --out names a folder.")
     check_writable(out, f"the output folder {out} cannot be written")
-    data, info = open_dataset(options.dataset, options.root, options.split, options.units)
+    data, info = open_dataset(options.dataset, options.root, options.split, options.units, options.targets)
     wanted = pictures(data, options)
     if not wanted:
         raise ConfigError(f"no picture of {info.title} is left: check --images and the test's targets.")
@@ -86,6 +87,8 @@ def evaluate(
     else:
         records = _records(options, detections_for(data, options), folder, wanted, progress)
         cases, guesses, notes = _from_records(data, records)
+        if options.protocol == RBOT and any(c.counted for c in cases):
+            notes["protocol"] = summary(options, data, info, records)
     if not any(c.counted for c in cases):
         raise ConfigError("no instance is left to be found: check --objects and --min-visible.")
     meter = VsdMeter(data, info.vsd_delta) if with_vsd and _has_depth(data, wanted) else None
@@ -267,7 +270,7 @@ def _results(
             "split": data.split,
             "split_list": getattr(data, "split_label", None),
             "split_hash": getattr(data, "split_hash", None),
-            "instances": "the test's targets" if options.min_visible is None else f"visible >= {options.min_visible:g}",
+            "instances": _asked(options),
             "masks": notes.get("masks", {}),
         },
         "options": options.as_dict(),
@@ -278,10 +281,16 @@ def _results(
         **table.summarise(scored, info, objects),
         "seconds_per_picture": notes.get("seconds_per_picture", _mean(notes.get("pictures", {}))),
     }
-    for key in ("detection_ap", "csv", "rows", "rows_used"):
+    for key in ("protocol", "detection_ap", "csv", "rows", "rows_used"):
         if key in notes:
             results[key] = notes[key]
     return results | {"instances": table.instances(scored)}
+
+
+def _asked(options: EvalOptions) -> str:
+    if options.min_visible is not None:
+        return f"visible >= {options.min_visible:g}"
+    return "all frames after the first" if options.protocol == RBOT else "the test's targets"
 
 
 def _mean(times: Mapping[Any, float]) -> float | None:

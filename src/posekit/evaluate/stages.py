@@ -27,7 +27,8 @@ from posekit.detect.segmentation import encode, xywh
 from posekit.errors import PromptError
 from posekit.estimate.estimator import Estimators, PoseEstimator
 from posekit.estimate.instances import SearchOptions, find_instances, scored_by_poses
-from posekit.evaluate.options import DETECTOR, GIVEN, EvalOptions
+from posekit.evaluate.options import DETECTOR, GIVEN, RBOT, EvalOptions
+from posekit.evaluate.rbot import RbotProtocol
 from posekit.evaluate.tracking import Sequences
 from posekit.evaluate.truths import Truth, TruthReader, pictures, selected
 from posekit.geometry import Pose
@@ -47,10 +48,14 @@ class ImageStage:
 
     def __init__(self, options: EvalOptions, files: Regions | None = None) -> None:
         self.options = options
-        self.data, self.info = open_dataset(options.dataset, options.root, options.split, options.units)
+        self.data, self.info = open_dataset(
+            options.dataset, options.root, options.split, options.units, options.targets
+        )
         self.truths = TruthReader(self.data)
         self._estimators: Estimators | None = None
-        self._sequences = Sequences(self._estimator, "openvino" if options.preset == "lite" else "torch")
+        runtime = "openvino" if options.preset == "lite" else "torch"
+        self._sequences = Sequences(self._estimator, runtime)
+        self._rbot = RbotProtocol(self.data, self._estimator, runtime, options.resets)
         self._files: Regions = detections_for(self.data, options) if files is None else files
         self._detector: Detector | None = None
 
@@ -66,6 +71,8 @@ class ImageStage:
             record["estimates"], found = self._detected(view, scene, image)
             record["detections"] = overlaps(found, truths)
             return record
+        if view is not None and self.options.protocol == RBOT:
+            return record | self._judged(record["truths"], view, truths, chosen)
         regions = [] if view is None else self._regions(view, scene, image)
         record["estimates"] = [] if view is None else self._estimates(view, truths, chosen, regions)
         if self._files:
@@ -91,6 +98,26 @@ class ImageStage:
         found = self._sequences.step(truths[0].instance.scene, view, truths, chosen)
         entries = [(each.state, _entry(each.estimate, obj_id, index)) for each, obj_id, index in found if each.estimate]
         return [entry | {"state": state} for state, entry in entries]
+
+    def _judged(self, entries: list[Record], view: View, truths: list[Truth], chosen: list[Truth]) -> Record:
+        """Truths and estimates by RBOT's protocol. A pose that was given is no estimate, and its frame not counted."""
+        if not truths:
+            return {"estimates": []}
+        judged = self._rbot.step(truths[0].instance.scene, view, chosen)
+        by_index = {each.truth.instance.index: each for each in judged}
+        for entry in entries:
+            each = by_index.get(entry["index"])
+            entry["counted"] = each is not None and not each.given
+            if each is not None and not each.given:
+                entry |= {"right": each.right, "reset": each.reset}
+        return {
+            "truths": entries,
+            "estimates": [
+                _entry(e.found.estimate, e.truth.instance.obj_id, e.truth.instance.index) | {"state": e.found.state}
+                for e in judged
+                if not e.given and e.found.estimate is not None
+            ],
+        }
 
     def _refined(self, view: View, truth: Truth) -> Record:
         instance, estimator = truth.instance, self._estimator(truth.instance.obj_id)

@@ -14,6 +14,7 @@ from posekit.errors import ConfigError, InputError
 from posekit.synth.motion import MIXED, MOTIONS
 
 KINDS = ("randomised", "photoreal", "scenes", "sequence")
+RBOT_VARIANTS, ALL = ("regular", "light", "noise", "occlusion"), "all"
 PER_SCENE = 1000  # images in a folder, where nothing else says how many belong together
 CONFIG = "synth.json"
 
@@ -36,12 +37,19 @@ class SynthConfig:
     samples: int = 32  # light paths for each pixel
     variant: str = "auto"  # Mitsuba's, "auto" = the fastest one here
     motion: str = MIXED  # of sequences, "mixed" = each of `MOTIONS` in turn
+    rbot: str = ""  # sequences in RBOT's manner: one of its variants, or "all" of them in turn
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise ConfigError(f"the kind is one of {', '.join(KINDS)}, not {self.kind!r}.")
         if self.motion != MIXED and self.motion not in MOTIONS:
             raise ConfigError(f"the motion is {MIXED} or one of {', '.join(MOTIONS)}, not {self.motion!r}.")
+        if self.rbot and self.rbot not in (*RBOT_VARIANTS, ALL):
+            raise ConfigError(f"RBOT's variant is one of {', '.join((*RBOT_VARIANTS, ALL))}, not {self.rbot!r}.")
+        if self.rbot and (self.kind != "sequence" or self.motion != MIXED):
+            raise ConfigError(
+                "RBOT's manner is one of sequences, with a motion of its own: pass --kind sequence, and no --motion."
+            )
         if min(self.images, self.frames, self.views, self.samples) < 1:
             raise ConfigError("images, frames, views and samples are at least 1.")
         if min(self.size) < 32 or max(self.size) > 4096:

@@ -15,6 +15,7 @@ from typing import Any
 
 from posekit.datasets.bop_writer import BopWriter, write_models
 from posekit.datasets.registry import NAMES, own_names
+from posekit.datasets.sequences import SEQUENCES
 from posekit.errors import ConfigError, OutputError
 from posekit.io.files import check_writable, write_text_atomic
 from posekit.machines import Machines, in_order
@@ -43,6 +44,10 @@ def begin(config: SynthConfig, root: Path, models: Mapping[int, ObjectModel]) ->
     if not models:
         raise ConfigError("a synthetic data set needs objects: pass --models.")
     check_new(root)
+    if config.rbot:
+        from posekit.synth.rbot import check_meshes
+
+        check_meshes(config, list(models))
     write_models(root, models)
     names = {str(obj_id): model.name for obj_id, model in sorted(models.items())}
     _write_json(root / NAMES, names)
@@ -67,9 +72,10 @@ def run(root: Path, machines: Machines, show: Show, shard: int = 0) -> int:
         _remove_leftovers(root)
         writer.finish(own_names(root), f"posekit synth --kind {config.kind} --seed {config.seed}")
         if config.kind == "sequence":
+            from posekit.synth.rbot import rbot_sequences
             from posekit.synth.sequence import sequences
 
-            _write_json(root / "sequences.json", sequences(config))
+            _write_json(root / SEQUENCES, rbot_sequences(config, ids) if config.rbot else sequences(config))
         write_report(root, config.split)
     if shard:
         write_shards(root, config.split, shard)
@@ -124,6 +130,10 @@ def make_maker(config: SynthConfig, models: Mapping[int, ObjectModel]) -> Maker:
         from posekit.synth.randomised import Randomised
 
         return Randomised(config, models, renderer)
+    if config.rbot:
+        from posekit.synth.rbot import RbotSequences
+
+        return RbotSequences(config, models, renderer)
     if config.kind == "sequence":
         from posekit.synth.sequence import Sequences
 
