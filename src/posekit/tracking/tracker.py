@@ -33,7 +33,7 @@ from posekit.results import Branch, Detection, Estimate
 from posekit.tracking.points import Keyframe, follow_points, match_texture
 from posekit.view import View
 
-TRACKED, RESTARTED, LOST = "tracked", "restarted", "lost"
+TRACKED, UNCERTAIN, LOST = "tracked", "uncertain", "lost"
 MASKS, MOTIONS, RUNTIMES = ("colours", "pose", "none"), ("points", "velocity", "none"), ("openvino", "torch")
 NEAR = 0.6  # diameters, the least distance of an object's centre that is accepted
 # standard deviations of a turn in degrees, a shift in pixels of the crop, and a depth in shares of the distance
@@ -114,11 +114,17 @@ class TrackConfig:
 
 @dataclass(frozen=True, eq=False)
 class Tracked:
-    """The result for a frame. state: "tracked", "restarted" (a new first pose) or "lost". estimate: None
-    where it is lost; its score is the share of its silhouette that has the object's colours."""
+    """The result for a frame.
+
+    state: "tracked" (the picture bears the pose out), "uncertain" (the pose is a prediction: what the picture shows is
+    too little to tell, or contradicts it) or "lost" (no pose). estimate: None where it is lost; its score is the share
+    of its silhouette that has the object's colours. restarted: whether this is the first frame after a search rather
+    than a continuation of the last frame's pose.
+    """
 
     state: str
     estimate: Estimate | None = None
+    restarted: bool = False
 
     @property
     def T_cam_obj(self) -> Pose | None:
@@ -127,8 +133,9 @@ class Tracked:
 
     @property
     def reliable(self) -> bool:
-        """Whether there is an estimate that can be used."""
-        return self.estimate is not None and self.estimate.reliable
+        """Whether the pose can be used: it is tracked, and its score and predicted angle are those of a reliable
+        estimate."""
+        return self.state == TRACKED and self.estimate is not None and self.estimate.reliable
 
     @property
     def angle(self) -> float | None:
@@ -201,8 +208,10 @@ class Tracker:
                 return Tracked(TRACKED, self._on_branch(given, Branch.GIVEN))
         if self._state is not None:
             found = self._follow(view, self._state)
-            if found is not None and not self._is_lost(view, found):
-                return Tracked(TRACKED, self._on_branch(found))
+            if found is not None:
+                state = self._judged(view, found)
+                if state != LOST:
+                    return Tracked(state, self._on_branch(found))
             self._reset()
         return self._find(view)
 
@@ -460,8 +469,9 @@ class Tracker:
 
     # --- losing and finding ---
 
-    def _is_lost(self, view: View, found: Estimate) -> bool:
-        """Whether too little of the object has been seen for too long; at once where it is outside the picture."""
+    def _judged(self, view: View, found: Estimate) -> str:
+        """The state of a frame that was followed: uncertain where the evidence is missing or contradicts, lost where it
+        has been so for too long, and at once where the object is outside the picture."""
         x0, y0, x1, y1 = found.box
         width, height = view.camera.size
         inside = max(0.0, min(x1, width) - max(x0, 0.0)) * max(0.0, min(y1, height) - max(y0, 0.0))
@@ -472,7 +482,9 @@ class Tracker:
             or (math.degrees(found.angle) > self.config.restart_deg and not self._outline_holds())
         )
         self._doubts = self._doubts + 1 if in_doubt else 0
-        return share == 0 or self._doubts >= self.config.doubts
+        if share == 0 or self._doubts >= self.config.doubts:
+            return LOST
+        return UNCERTAIN if in_doubt else TRACKED
 
     def _outline_holds(self) -> bool:
         """Whether the last frame's silhouette separates the colours at least half as well as the first one's did.
@@ -498,7 +510,7 @@ class Tracker:
         if not found.instances or not self._begin(view, found.instances[0].T_cam_obj, found.instances[0].angle):
             return Tracked(LOST)
         self._waiting = 0
-        return Tracked(RESTARTED, self._on_branch(found.instances[0]))
+        return Tracked(TRACKED, self._on_branch(found.instances[0]), restarted=True)
 
 
 def _about(pose: Pose, camera: Camera, spread: tuple[float, float, float]) -> GaussianPose:
