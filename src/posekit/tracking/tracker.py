@@ -10,8 +10,9 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from threading import Lock
 from typing import Protocol
 
 import numpy as np
@@ -30,8 +31,10 @@ from posekit.nets.pose_delta import apply_delta
 from posekit.nets.precision import usable_cores
 from posekit.nets.predictor import PairPrediction, Predictor
 from posekit.results import Branch, Detection, Estimate
+from posekit.tracking.memory import Memory, distinct
 from posekit.tracking.points import Keyframe, follow_points, match_texture
 from posekit.view import View
+from posekit.zoom import zoom_to_pose
 
 TRACKED, UNCERTAIN, LOST = "tracked", "uncertain", "lost"
 MASKS, MOTIONS, RUNTIMES = ("colours", "pose", "none"), ("points", "velocity", "none"), ("openvino", "torch")
@@ -52,6 +55,15 @@ TINT_RATE = 0.15  # weight of a frame in the running tint
 COARSE = 1500  # of the mesh that is drawn where the outline is looked for in smaller crops
 FACES = 6000  # of the mesh that is drawn: a crop shows no more
 LEAST_SCALE, KNEE = 0.5, 2.5  # pixels, no correspondence is more exact; standard deviations
+
+
+# of a lost object that is looked for by memory: standard deviations as above of where it is looked for; candidates by
+# colours, and those that are compared; the contrast of its silhouette as a share of what it was when it was followed
+REGAINED = (15.0, 12.0, 0.15)
+CANDIDATES, COMPARED, LEAST_CONTRAST = 8, 3, 0.7
+SURE = 0.6  # share of a silhouette with the object's colours from which on a frame is remembered
+
+_ONE_SEARCH = Lock()  # detectors and estimators are shared by trackers, and searches take a core each
 
 
 class Finder(Protocol):
@@ -93,6 +105,13 @@ class TrackConfig:
     least_inside: float = 0.3  # share of the silhouette's box in the picture, likewise
     doubts: int = 3  # frames in doubt in a row after which the object is lost
     search: int = 5  # frames between two attempts to find it
+    # whether a lost object is searched beside the loop, in a thread, so that no frame waits for a search; which frame
+    # it is found in then depends on the machine's speed. search_share: the share of the time that is searched then, at
+    # most. search_age: seconds after which a found pose is too old to be brought to the newest frame
+    search_beside: bool = False
+    search_share: float = 0.5
+    search_age: float = 10.0
+    remember: bool = True  # whether views of the followed object are kept, and a lost one is looked for by them
     runtime: str = "openvino"  # of the network
 
     def __post_init__(self) -> None:
@@ -105,6 +124,8 @@ class TrackConfig:
             raise ConfigError("iterations, doubts and search are at least 1.")
         if not all(0 <= share <= 1 for share in (self.prior, self.min_colour_share, self.learn, self.least_inside)):
             raise ConfigError("prior, min_colour_share, learn and least_inside are shares between 0 and 1.")
+        if not 0 < self.search_share <= 1 or not self.search_age > 0:
+            raise ConfigError("search_share is a share above 0, at most 1, and search_age is above 0 seconds.")
         if not 0 < self.keep <= 1:
             raise ConfigError(f"keep is a share above 0, at most 1, not {self.keep:g}.")
         for name, known in (("mask", MASKS), ("motion", MOTIONS), ("runtime", RUNTIMES)):
@@ -148,8 +169,8 @@ class Tracker:
 
     camera: of all frames, unless `step` is given another. pose: ``T_cam_obj`` in the first frame, where it is known.
     estimator: of this model; made with the shipped weights where it is not given. detector: finds the object in the
-    first frame and when it is lost; without one a lost object stays lost. predictor: in place of the one that
-    ``config.runtime`` names.
+    first frame and when it is lost; without one a lost object is looked for only by what was seen of it while it was
+    followed. predictor: in place of the one that ``config.runtime`` names.
     Not thread-safe: one tracker per thread. Raises ConfigError where neither pose nor detector is given.
     """
 
@@ -186,6 +207,11 @@ class Tracker:
         self._grown = dict.fromkeys({1, *config.scales}, 0.0)  # pixels, see `_growth`
         self._bias = 0.0  # pixels of the crop: how far the network alone has been from what all evidence gave
         self._waiting = 0  # frames until the next search
+        self._memory = Memory(model, self.renderer)
+        self._known: _Known | None = None
+        self._searching: Future[Tracked] | None = None  # of a search beside the loop
+        self._searcher: ThreadPoolExecutor | None = None
+        self._search_began = self._search_next = 0.0  # seconds of time.monotonic
 
     def step(
         self, image: NDArray[np.uint8], camera: Camera | None = None, valid: NDArray[np.bool_] | None = None
@@ -206,14 +232,16 @@ class Tracker:
                 timings = {"network": network, "total": time.perf_counter() - started}
                 given = self._estimate(view, pose, prediction.angle, 0, 1.0, timings)
                 return Tracked(TRACKED, self._on_branch(given, Branch.GIVEN))
-        if self._state is not None:
+        if self._state is not None and self._searching is None:  # a search has the state to itself
             found = self._follow(view, self._state)
             if found is not None:
                 state = self._judged(view, found)
+                if state == TRACKED:
+                    self._remember(view, found)
                 if state != LOST:
                     return Tracked(state, self._on_branch(found))
             self._reset()
-        return self._find(view)
+        return self._find_beside(view) if self.config.search_beside else self._find(view)
 
     # --- following ---
 
@@ -255,11 +283,18 @@ class Tracker:
 
     def _follow(self, view: View, last: GaussianPose) -> Estimate | None:
         """From where the object is expected; None where it cannot be compared."""
-        started, network, angle, comparisons = time.perf_counter(), 0.0, 0.0, 0
-        before, colours, tint = self._before, self._colours, self._tint
-        assert before is not None and colours is not None and tint is not None
+        started = time.perf_counter()
+        before, colours = self._before, self._colours
+        assert before is not None and colours is not None
         predicted = self._outlined(view, self._predicted(view, before, last, colours), last, colours)
-        state = predicted
+        return self._measured(view, predicted, last.pose, started)
+
+    def _measured(self, view: View, predicted: GaussianPose, last: Pose, started: float) -> Estimate | None:
+        """From an expected ``T_cam_ctr``; None where it cannot be compared. last: ``T_cam_ctr`` in the frame before.
+        started: in seconds of time.perf_counter."""
+        network, angle, comparisons = 0.0, 0.0, 0
+        colours, tint, state = self._colours, self._tint, predicted
+        assert colours is not None and tint is not None
         while comparisons < self.config.iterations:
             comparisons += 1
             pose = state.pose @ self.model.T_ctr_obj
@@ -293,7 +328,7 @@ class Tracker:
         assert drawn.mask is not None
         shown = drawn.mask & seen.shown
         share = float((visible & shown).sum() / max(1, shown.sum()))
-        self._motion = Pose(state.pose.R @ last.pose.R.T, state.pose.t - last.pose.t)
+        self._motion = Pose(state.pose.R @ last.R.T, state.pose.t - last.t)
         self._state, self._before = state, keyframe
         self._separated = contrast(seen, drawn.mask, colours)
         if (
@@ -497,20 +532,133 @@ class Tracker:
         self._state = self._before = self._colours = None
         self._motion, self._doubts, self._waiting = Pose.identity(), 0, 0
 
+    def _remember(self, view: View, found: Estimate) -> None:
+        """What is known of the object in a frame that is tracked."""
+        state, before = self._know()
+        sure = found.score > SURE and (math.degrees(found.angle) < self.config.restart_deg or self._outline_holds())
+        T_view_ctr = Pose.rotation(before.seen.R_view_cam) @ state.pose
+        if self.config.remember and sure and self._memory.wants(T_view_ctr):
+            self._memory.keep(view, before, T_view_ctr)
+
+    def _know(self) -> tuple[GaussianPose, Keyframe]:
+        """Keep what the last frame tells."""
+        state, before, colours, tint = self._state, self._before, self._colours, self._tint
+        assert state is not None and before is not None and colours is not None and tint is not None
+        self._known = _Known(state.pose, colours, tint, self._separated_first)
+        return state, before
+
     def _find(self, view: View) -> Tracked:
-        """A new first pose, where there is one. A search takes seconds, so not every frame is searched."""
+        """A new first pose, where there is one. A search takes time, so not every frame is searched."""
         self._waiting -= 1
-        if self.detector is None or self._waiting > 0:
+        if self._waiting > 0:
             return Tracked(LOST)
         self._waiting = self.config.search
+        found = self._searched(view)
+        if found.state != LOST:
+            self._waiting = 0
+        return found
+
+    def _find_beside(self, view: View) -> Tracked:
+        """The same without waiting for the search, which has a frame of its own."""
+        if self._searching is None:
+            if time.monotonic() >= self._search_next:
+                self._searcher = self._searcher or ThreadPoolExecutor(1, "posekit-search")
+                self._search_began = time.monotonic()
+                self._searching = self._searcher.submit(self._searched, view)
+            return Tracked(LOST)
+        if not self._searching.done():
+            return Tracked(LOST)
+        answer, self._searching = self._searching, None
+        now = time.monotonic()
+        self._search_next = now + (now - self._search_began) * (1 / self.config.search_share - 1)
+        found = answer.result()
+        if found.estimate is None or now - self._search_began > self.config.search_age:
+            self._reset()
+            return Tracked(LOST)
+        return self._brought_on(view, found.estimate)
+
+    def _brought_on(self, view: View, found: Estimate) -> Tracked:
+        """A pose that was found in an earlier frame, in the newest one."""
+        self._know()
+        there = self._regained(view, [found.T_cam_obj])
+        there = there or self._regained(view, self._by_colours(view))
+        if there is None:
+            self._reset()
+            return Tracked(LOST)
+        return Tracked(TRACKED, self._on_branch(there), restarted=True)
+
+    def _searched(self, view: View) -> Tracked:
+        """By memory, else by the detector. It is tracked from then on where it is found."""
+        with _ONE_SEARCH:
+            found = self._recalled(view) or self._detected(view)
+        return Tracked(LOST) if found is None else Tracked(TRACKED, self._on_branch(found), restarted=True)
+
+    def _recalled(self, view: View) -> Estimate | None:
+        """Where views that were kept, and colours that were learned, lead to."""
+        if not self.config.remember or self._known is None:
+            return None
+        last = self._known.T_cam_ctr @ self.model.T_ctr_obj
+        found = self._regained(view, [last, *self._by_colours(view)])
+        return found or self._regained(view, self._memory.by_features(view))
+
+    def _by_colours(self, view: View) -> list[Pose]:
+        assert self._known is not None
+        found = self._memory.by_colours(view, self._known.colours, self._known.T_cam_ctr, CANDIDATES)
+        return distinct(found, self.model)
+
+    def _regained(self, view: View, candidates: Sequence[Pose]) -> Estimate | None:
+        """The first of the ``T_cam_obj``, fitted to the frame, that the evidence bears out; it is followed from then
+        on. Those are compared whose silhouette separates the known colours best."""
+        known = self._known
+        assert known is not None
+        fitted = []
+        for pose in candidates:
+            if not self._in_front(pose):
+                continue
+            centred = pose @ self.model.T_obj_ctr
+            camera = self._crop_camera(view, pose)
+            start = self._aligned(view, _about(centred, camera, REGAINED), known.colours, self.config.scales)
+            fitted.append((self._separation(view, start.pose, known.colours), start))
+        fitted.sort(key=lambda each: -each[0])
+        for quality, start in fitted[:COMPARED]:
+            if quality < max(CLEAR, LEAST_CONTRAST * known.separated):
+                break
+            self._colours, self._tint, self._separated_first = known.colours, known.tint, known.separated
+            self._doubts, started = 0, time.perf_counter()
+            found = self._measured(view, start, start.pose, started)
+            if found is not None and self._judged(view, found) == TRACKED and found.score > SURE:
+                self._motion = Pose.identity()
+                return found
+            self._reset()
+        return None
+
+    def _crop_camera(self, view: View, pose: Pose) -> Camera:
+        return zoom_to_pose(view.camera, pose @ self.model.T_obj_ctr, self._outline, self.predictor.size).camera
+
+    def _detected(self, view: View) -> Estimate | None:
+        """What the detector and a search of the mesh find."""
+        if self.detector is None:
+            return None
         detections = self.detector.detect(view, [self.model])
         # a person's word for the first frame is taken; later detections may be wrong, whatever the detector
         options = SearchOptions.usual(detections) if self._last_pose is None else SearchOptions()
         [found] = find_instances(lambda _: self.estimator, view, [self.model], detections, options)
         if not found.instances or not self._begin(view, found.instances[0].T_cam_obj, found.instances[0].angle):
-            return Tracked(LOST)
-        self._waiting = 0
-        return Tracked(TRACKED, self._on_branch(found.instances[0]), restarted=True)
+            return None
+        _, before = self._know()
+        if self.config.remember and not self._memory.views:
+            self._memory.keep(view, before, before.T_view_ctr)
+        return found.instances[0]
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """Of the last frame that was tracked. separated: contrast of a silhouette in its place."""
+
+    T_cam_ctr: Pose
+    colours: Colours
+    tint: Tint
+    separated: float
 
 
 def _about(pose: Pose, camera: Camera, spread: tuple[float, float, float]) -> GaussianPose:
