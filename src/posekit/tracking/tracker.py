@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from posekit.align.colour_edge import Colours, Tint, contrast, learn, like_mesh, off_colour, outline_lines
-from posekit.align.gauss_newton import GaussianPose, Points, Residual, fuse
+from posekit.align.gauss_newton import GaussianPose, Lines, Points, Residual, fuse
 from posekit.camera import Camera
 from posekit.errors import CameraError, ConfigError
 from posekit.estimate.estimator import PoseEstimator, nearest_to
@@ -62,6 +62,16 @@ LEAST_SCALE, KNEE = 0.5, 2.5  # pixels, no correspondence is more exact; standar
 REGAINED = (15.0, 12.0, 0.15)
 CANDIDATES, COMPARED, LEAST_CONTRAST = 8, 3, 0.7
 SURE = 0.6  # share of a silhouette with the object's colours from which on a frame is remembered
+
+# what contradicts a pose: less than this share of its outline within NEAR_PX pixels of where the colours put it; less
+# than this share of the first silhouette's contrast; a predicted angle (degrees) and a median distance of the network's
+# correspondences (pixels) above these and above TWICE what they usually are. CONTRADICTED of the four are needed.
+# Chosen on made sequences: docs/decisions/0024
+BORNE_OUT, NEAR_PX, LESS_CONTRAST, WIDE_DEG, WIDE_PX, TWICE = 0.5, 1.5, 0.7, 10.0, 1.5, 2.0
+CONTRADICTED, USUAL_RATE = 2, 0.1
+# what `Tracker._recalled` changes
+FOLLOWED = ("_state", "_before", "_colours", "_tint", "_motion", "_doubts", "_separated", "_separated_first", "_bias",
+            "_waiting", "_contradictions", "_contradicted")  # fmt: skip
 
 _ONE_SEARCH = Lock()  # detectors and estimators are shared by trackers, and searches take a core each
 
@@ -203,6 +213,8 @@ class Tracker:
         self._colours: Colours | None = None
         self._tint: Tint | None = None
         self._doubts = 0
+        self._contradictions = self._contradicted = 0  # of the last frame; frames in a row that are contradicted
+        self._usual = (0.0, 0.0)  # radians and pixels: the network's angle and its correspondences' distance
         self._separated = self._separated_first = 0.0  # contrast of the last silhouette and of the first
         self._grown = dict.fromkeys({1, *config.scales}, 0.0)  # pixels, see `_growth`
         self._bias = 0.0  # pixels of the crop: how far the network alone has been from what all evidence gave
@@ -229,6 +241,7 @@ class Tracker:
                 assert self._before is not None
                 prediction, network = self._compared(self._before.seen, self._before.drawn, self._before.visible)
                 self._bias = self._disagreement(self._before, prediction, self._before.T_view_ctr)
+                self._usual = prediction.angle, self._distance(self._before, prediction, self._before.T_view_ctr)
                 timings = {"network": network, "total": time.perf_counter() - started}
                 given = self._estimate(view, pose, prediction.angle, 0, 1.0, timings)
                 return Tracked(TRACKED, self._on_branch(given, Branch.GIVEN))
@@ -238,6 +251,8 @@ class Tracker:
                 state = self._judged(view, found)
                 if state == TRACKED:
                     self._remember(view, found)
+                elif state == UNCERTAIN and (better := self._better(view)) is not None:
+                    return Tracked(TRACKED, self._on_branch(better), restarted=True)
                 if state != LOST:
                     return Tracked(state, self._on_branch(found))
             self._reset()
@@ -331,6 +346,7 @@ class Tracker:
         self._motion = Pose(state.pose.R @ last.R.T, state.pose.t - last.t)
         self._state, self._before = state, keyframe
         self._separated = contrast(seen, drawn.mask, colours)
+        self._contradictions = self._contradicting(keyframe, prediction, more, there)
         if (
             angle < math.radians(self.config.restart_deg) or self._outline_holds()
         ) and share > self.config.min_colour_share:
@@ -338,6 +354,42 @@ class Tracker:
         self._tint = new_tint
         timings = {"network": network, "total": time.perf_counter() - started}
         return self._estimate(view, pose, angle, comparisons, share, timings)
+
+    def _contradicting(
+        self, keyframe: Keyframe, prediction: PairPrediction, more: Sequence[Residual], T_view_ctr: Pose
+    ) -> int:
+        """How many kinds of evidence contradict a pose: outline, colours, the network's angle and its correspondences.
+        The network is believed as far as it has agreed before: on a mesh without colours it never does."""
+        near = [
+            np.abs(((keyframe.drawn.camera.project(T_view_ctr.apply(r.points)) - r.places) * r.normals).sum(axis=1))
+            for r in more
+            if isinstance(r, Lines)
+        ]
+        borne_out = sum(int((each < NEAR_PX).sum()) for each in near) / max(1, len(keyframe.outline[0]))
+        distance, (usual_angle, usual_distance) = self._distance(keyframe, prediction, T_view_ctr), self._usual
+        kinds = (
+            self.config.outline and borne_out < BORNE_OUT,
+            self._separated < LESS_CONTRAST * self._separated_first,
+            prediction.angle > max(math.radians(WIDE_DEG), TWICE * usual_angle),
+            distance > max(WIDE_PX, TWICE * usual_distance),
+        )
+        count = sum(kinds)
+        if count < CONTRADICTED:
+            self._usual = (
+                usual_angle + USUAL_RATE * (prediction.angle - usual_angle),
+                usual_distance + USUAL_RATE * (distance - usual_distance),
+            )
+        return count
+
+    def _distance(self, keyframe: Keyframe, prediction: PairPrediction, T_view_ctr: Pose) -> float:
+        """The median distance, pixels, of the network's correspondences from where a pose puts them; 0 without any."""
+        found, drawn = prediction.correspondences, keyframe.drawn
+        if found is None or not len(found.source):
+            return 0.0
+        assert drawn.coords is not None
+        points = drawn.coords[found.source[:, 1], found.source[:, 0]] - self.model.center
+        there = drawn.camera.project(T_view_ctr.apply(points.astype(np.float64)))
+        return float(np.median(np.linalg.norm(there - found.target, axis=1)))
 
     def _predicted(self, view: View, before: Keyframe, last: GaussianPose, colours: Colours) -> GaussianPose:
         """Where the object is expected, as ``T_cam_ctr``: from the last frame, without a comparison with the mesh."""
@@ -517,9 +569,11 @@ class Tracker:
             or (math.degrees(found.angle) > self.config.restart_deg and not self._outline_holds())
         )
         self._doubts = self._doubts + 1 if in_doubt else 0
+        contradicted = self._contradictions >= CONTRADICTED
+        self._contradicted = self._contradicted + 1 if contradicted else 0
         if share == 0 or self._doubts >= self.config.doubts:
             return LOST
-        return UNCERTAIN if in_doubt else TRACKED
+        return UNCERTAIN if in_doubt or contradicted else TRACKED
 
     def _outline_holds(self) -> bool:
         """Whether the last frame's silhouette separates the colours at least half as well as the first one's did.
@@ -531,6 +585,7 @@ class Tracker:
     def _reset(self) -> None:
         self._state = self._before = self._colours = None
         self._motion, self._doubts, self._waiting = Pose.identity(), 0, 0
+        self._contradictions = self._contradicted = 0
 
     def _remember(self, view: View, found: Estimate) -> None:
         """What is known of the object in a frame that is tracked."""
@@ -539,6 +594,19 @@ class Tracker:
         T_view_ctr = Pose.rotation(before.seen.R_view_cam) @ state.pose
         if self.config.remember and sure and self._memory.wants(T_view_ctr):
             self._memory.keep(view, before, T_view_ctr)
+
+    def _better(self, view: View) -> Estimate | None:
+        """What memory finds when a pose has been contradicted for some frames; where it finds nothing that is borne
+        out, the pose is followed further."""
+        late = self._contradicted - self.config.doubts
+        if self.config.search_beside or late < 0 or late % self.config.search:
+            return None
+        kept = {name: getattr(self, name) for name in FOLLOWED}
+        found = self._recalled(view)
+        if found is None:
+            for name, value in kept.items():
+                setattr(self, name, value)
+        return found
 
     def _know(self) -> tuple[GaussianPose, Keyframe]:
         """Keep what the last frame tells."""
