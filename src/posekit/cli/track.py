@@ -110,7 +110,9 @@ def track(
     live: Annotated[
         bool,
         typer.Option(
-            "--live", help="For cameras: skip frames that come while one is worked on.", rich_help_panel=OUTPUT
+            "--live",
+            help="For cameras: skip frames that come while one is worked on, and search a lost object beside the loop.",
+            rich_help_panel=OUTPUT,
         ),
     ] = False,
     frames: Annotated[
@@ -141,7 +143,9 @@ def track(
     if pose and len(pose) != len(model):
         raise PromptError(f"{len(pose)} --pose for {len(model)} --model: give one for each, in their order, or none.")
     use_threads(threads)
-    config = TrackConfig(restart_angle, still_angle, iterations=iterations, runtime=runtime)
+    config = TrackConfig(
+        restart_angle, still_angle, iterations=iterations, runtime=runtime, search_beside=live
+    )  # without --live a search is waited for: the results do not depend on the machine's speed
     starts = [load_pose(path) for path in pose] if pose else [None] * len(model)
     meshes = load_meshes(model, units, symmetry)
     sequence = ReadAhead(open_frames(source, camera), latest=live)

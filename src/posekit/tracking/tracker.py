@@ -30,7 +30,7 @@ from posekit.mesh.model import ObjectModel
 from posekit.nets.pose_delta import apply_delta
 from posekit.nets.precision import usable_cores
 from posekit.nets.predictor import PairPrediction, Predictor
-from posekit.results import Branch, Detection, Estimate
+from posekit.results import Branch, Detection, Estimate, Source
 from posekit.tracking.memory import Memory, distinct
 from posekit.tracking.points import Keyframe, follow_points, match_texture
 from posekit.view import View
@@ -60,7 +60,8 @@ LEAST_SCALE, KNEE = 0.5, 2.5  # pixels, no correspondence is more exact; standar
 # of a lost object that is looked for by memory: standard deviations as above of where it is looked for; candidates by
 # colours, and those that are compared; the contrast of its silhouette as a share of what it was when it was followed
 REGAINED = (15.0, 12.0, 0.15)
-CANDIDATES, COMPARED, LEAST_CONTRAST = 8, 3, 0.7
+CANDIDATES, COMPARED, LEAST_CONTRAST, PLACE_CONTRAST = 8, 3, 0.7, 0.5
+STEPS = 4  # comparisons of a frame with such a pose at most; one more follows the first that bears it out
 SURE = 0.6  # share of a silhouette with the object's colours from which on a frame is remembered
 
 # what contradicts a pose: less than this share of its outline within NEAR_PX pixels of where the colours put it; less
@@ -221,6 +222,7 @@ class Tracker:
         self._waiting = 0  # frames until the next search
         self._memory = Memory(model, self.renderer)
         self._known: _Known | None = None
+        self._place: Pose | None = None  # ``T_cam_obj``, where a search's frame has the object's colours
         self._searching: Future[Tracked] | None = None  # of a search beside the loop
         self._searcher: ThreadPoolExecutor | None = None
         self._search_began = self._search_next = 0.0  # seconds of time.monotonic
@@ -658,16 +660,26 @@ class Tracker:
     def _searched(self, view: View) -> Tracked:
         """By memory, else by the detector. It is tracked from then on where it is found."""
         with _ONE_SEARCH:
-            found = self._recalled(view) or self._detected(view)
+            found = self._recalled(view) or self._at_colours(view) or self._detected(view)
         return Tracked(LOST) if found is None else Tracked(TRACKED, self._on_branch(found), restarted=True)
 
     def _recalled(self, view: View) -> Estimate | None:
         """Where views that were kept, and colours that were learned, lead to."""
+        self._place = None
         if not self.config.remember or self._known is None:
             return None
         last = self._known.T_cam_ctr @ self.model.T_ctr_obj
-        found = self._regained(view, [last, *self._by_colours(view)])
-        return found or self._regained(view, self._memory.by_features(view))
+        found = self._regained(view, self._memory.by_features(view))
+        return found or self._regained(view, [last, *self._by_colours(view)])
+
+    def _at_colours(self, view: View) -> Estimate | None:
+        """What a search of the mesh's views finds where the frame has the object's colours: it may have turned."""
+        if self._place is None:
+            return None
+        box = view.camera.points_box(_before_camera(self._place.apply(self.model.hull_vertices)))
+        place, self._place = Detection(box, None, 1.0, self.model.name, Source.BOX), None
+        poses = [each.T_cam_obj for each in self.estimator.estimate(view, [place], SURE)]
+        return self._regained(view, poses)
 
     def _by_colours(self, view: View) -> list[Pose]:
         assert self._known is not None
@@ -688,13 +700,22 @@ class Tracker:
             start = self._aligned(view, _about(centred, camera, REGAINED), known.colours, self.config.scales)
             fitted.append((self._separation(view, start.pose, known.colours), start))
         fitted.sort(key=lambda each: -each[0])
+        self._place = None
+        if fitted and fitted[0][0] > max(CLEAR, PLACE_CONTRAST * known.separated):
+            self._place = fitted[0][1].pose @ self.model.T_ctr_obj
         for quality, start in fitted[:COMPARED]:
             if quality < max(CLEAR, LEAST_CONTRAST * known.separated):
                 break
             self._colours, self._tint, self._separated_first = known.colours, known.tint, known.separated
-            self._doubts, started = 0, time.perf_counter()
-            found = self._measured(view, start, start.pose, started)
-            if found is not None and self._judged(view, found) == TRACKED and found.score > SURE:
+            self._doubts, started, borne_out = 0, time.perf_counter(), False
+            for _ in range(STEPS):
+                found = self._measured(view, start, start.pose, started)
+                if found is None or borne_out:
+                    break
+                borne_out = self._judged(view, found) == TRACKED and found.score > SURE
+                assert self._state is not None
+                start = _about(self._state.pose, self._crop_camera(view, found.T_cam_obj), PREDICTED)
+            if found is not None and borne_out and self._judged(view, found) == TRACKED:
                 self._motion = Pose.identity()
                 return found
             self._reset()
