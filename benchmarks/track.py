@@ -39,7 +39,7 @@ from posekit.io.video import ReadAhead, SceneFrames, VideoFrames, VideoWriter
 from posekit.mesh.model import ObjectModel
 from posekit.metrics import pose_error
 from posekit.results import Detection, Source
-from posekit.tracking.tracker import LOST, RESTARTED, TRACKED, TrackConfig, Tracked, Tracker
+from posekit.tracking.tracker import LOST, TRACKED, UNCERTAIN, TrackConfig, Tracked, Tracker
 from posekit.view import View
 
 SEEN, HALF = 0.1, 0.5
@@ -97,7 +97,11 @@ def follow(data: BopDataset, scene: int, images: list[int], begin: int, obj_id: 
 
 
 def row(found: Tracked, truth: Instance | None, model: ObjectModel) -> dict[str, Any]:
-    entry: dict[str, Any] = {"state": found.state, "visible": truth.visib_fract if truth else 0.0}
+    entry: dict[str, Any] = {
+        "state": found.state,
+        "restarted": found.restarted,
+        "visible": truth.visib_fract if truth else 0.0,
+    }
     if found.estimate is not None:
         pose = found.estimate.T_cam_obj
         turn, shift = pose_error(pose, truth.T_cam_obj, model.symmetries.transforms()) if truth else (np.inf, np.inf)
@@ -125,8 +129,9 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         "outside": 1 - sum(r["network"] for r in timed) / wall if wall else 0.0,
         "5,5": 100 * float(np.mean(seen)) if seen else 0.0,
         "lost": sum(r["state"] == LOST for r in rows),
-        "restarted": sum(r["state"] == RESTARTED for r in rows),
-        "false": longest([r["visible"] == 0 and r["state"] != LOST for r in rows]),
+        "restarted": sum(r["restarted"] for r in rows),
+        "uncertain": sum(r["state"] == UNCERTAIN for r in rows),
+        "false": longest([r["visible"] == 0 and r["state"] == TRACKED for r in rows]),
         "back": recovery(rows, good),
     }
     return result | dict(zip(("jitter_deg", "jitter_mm"), jitter(rows), strict=True))
@@ -155,7 +160,7 @@ def recovery(rows: list[dict[str, Any]], good: list[bool]) -> int | None:
 def jitter(rows: list[dict[str, Any]]) -> tuple[float | None, float | None]:
     turns, shifts = [], []
     for a, b in itertools.pairwise(rows):
-        if a.get("truth") and b.get("truth") and b["state"] != RESTARTED:
+        if a.get("truth") and b.get("truth") and not b["restarted"]:
             true = b["truth"] @ a["truth"].inverse()
             off: Pose = (b["pose"] @ a["pose"].inverse()) @ true.inverse()
             turns.append(np.rad2deg(rotation_angle(off.R)))
@@ -210,7 +215,9 @@ def main() -> None:
     for root in args.roots:
         data = BopDataset(root, split=args.split)
         for scene in sorted({scene for scene, _ in data.images()}):
-            frames = SceneFrames(root / args.split / f"{scene:06d}")  # those where nothing is, too
+            frames = SceneFrames(
+                root / args.split / f"{scene:06d}" / "scene_camera.json"
+            )  # those where nothing is, too
             images = list(frames.cameras)[: args.frames]
             with tempfile.TemporaryDirectory() as folder:
                 video = Path(folder) / "scene.mp4"

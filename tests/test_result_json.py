@@ -22,7 +22,7 @@ from posekit.io.load import load_pose, load_view
 from posekit.mesh.model import ObjectModel
 from posekit.nets.weights import build, save_networks
 from posekit.render import Renderer
-from posekit.results import SCHEMA_VERSION, Detection, Source, estimates_from_json
+from posekit.results import SCHEMA_VERSION, Detection, Source, check_schema, document_to_json, estimates_from_json
 from posekit.synth.example import Example, make_example, ply
 from posekit.view import View
 
@@ -117,6 +117,19 @@ def test_track_writes_what_the_schema_says(folder: Path, tmp_path: Path) -> None
     for line in lines:
         check(line)
         assert line["schema"] == "posekit-frame"
+
+
+def test_frames_of_the_first_version_are_still_of_the_form() -> None:
+    frame = {"frame": 0, "model": "toy", "state": "restarted", "reliable": True, "T_cam_obj": None, "angle_deg": None,
+             "score": None}  # fmt: skip
+    old = {"schema": "posekit-frame", "schema_version": 1, **frame}
+    check(old)
+    check_schema(old)
+    newest = json.loads(document_to_json("posekit-frame", frame))
+    assert newest["schema_version"] == 2
+    check_schema(newest)
+    with pytest.raises(PromptError, match="versions up to 2"):
+        check_schema({**newest, "schema_version": 3})
 
 
 class Finder:

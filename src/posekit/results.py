@@ -26,6 +26,7 @@ RELIABLE_ANGLE_DEG = 15.0
 # entry leaves the version as it is; an entry that goes or changes its meaning raises it.
 RESULT_SCHEMA, FRAME_SCHEMA, DETECTIONS_SCHEMA = "posekit-result", "posekit-frame", "posekit-detections"
 SCHEMA_VERSION = 1
+FRAME_SCHEMA_VERSION = 2  # 1 had the state "restarted" and none that is uncertain
 
 
 class Source(StrEnum):
@@ -167,17 +168,23 @@ def estimates_to_json(
 def document_to_json(schema: str, entries: Mapping[str, Any], indent: int | None = 1) -> str:
     """A document's text, which begins with its kind (RESULT_SCHEMA and so on) and version: strict JSON, numbers that
     are not finite are null. indent: None writes one line."""
-    document = {"schema": schema, "schema_version": SCHEMA_VERSION, **entries}
+    document = {"schema": schema, "schema_version": _version_of(schema), **entries}
     return json.dumps(_strict(document), indent=indent, allow_nan=False) + "\n"
+
+
+def _version_of(schema: Any) -> int:
+    """The newest version of a kind of document."""
+    return FRAME_SCHEMA_VERSION if schema == FRAME_SCHEMA else SCHEMA_VERSION
 
 
 def check_schema(document: Any, label: str = "the file") -> None:
     """Whether this posekit knows the form of a document; one without a version is of posekit 0.1, or of another
     program. Raises PromptError where the version is a newer one."""
     version = document.get("schema_version") if isinstance(document, Mapping) else None
-    if isinstance(version, int) and version > SCHEMA_VERSION:
+    known = _version_of(document["schema"]) if isinstance(version, int) and "schema" in document else SCHEMA_VERSION
+    if isinstance(version, int) and version > known:
         raise PromptError(
-            f"{label} has schema_version {version}, and posekit {__version__} reads versions up to {SCHEMA_VERSION}: "
+            f"{label} has schema_version {version}, and posekit {__version__} reads versions up to {known}: "
             "a newer posekit wrote it. Update posekit, or write the file again with this one."
         )
 

@@ -110,7 +110,9 @@ def track(
     live: Annotated[
         bool,
         typer.Option(
-            "--live", help="For cameras: skip frames that come while one is worked on.", rich_help_panel=OUTPUT
+            "--live",
+            help="For cameras: skip frames that come while one is worked on, and search a lost object beside the loop.",
+            rich_help_panel=OUTPUT,
         ),
     ] = False,
     frames: Annotated[
@@ -136,12 +138,14 @@ def track(
     from posekit.estimate.estimator import Estimators
     from posekit.io.load import load_pose
     from posekit.io.video import ReadAhead, open_frames
-    from posekit.tracking.tracker import TrackConfig, Tracker
+    from posekit.tracking.tracker import TRACKED, UNCERTAIN, TrackConfig, Tracker
 
     if pose and len(pose) != len(model):
         raise PromptError(f"{len(pose)} --pose for {len(model)} --model: give one for each, in their order, or none.")
     use_threads(threads)
-    config = TrackConfig(restart_angle, still_angle, iterations=iterations, runtime=runtime)
+    config = TrackConfig(
+        restart_angle, still_angle, iterations=iterations, runtime=runtime, search_beside=live
+    )  # without --live a search is waited for: the results do not depend on the machine's speed
     starts = [load_pose(path) for path in pose] if pose else [None] * len(model)
     meshes = load_meshes(model, units, symmetry)
     sequence = ReadAhead(open_frames(source, camera), latest=live)
@@ -166,7 +170,8 @@ def track(
             for name, text in pose_files(kind, counts.poses).items():
                 counts.files.append(destination.folder.write(name, text))
     destination.say(f"reliable: {counts.reliable} of {counts.used * len(trackers)} poses")
-    destination.say(", ".join(f"{count} {state}" for state, count in counts.states.items()))
+    told = [f"{count} {state}" for state, count in counts.states.items()]
+    destination.say(", ".join([*told, f"{counts.restarts} found by a search"] if counts.restarts else told))
     if counts.problems:
         typer.echo(f"{len(counts.problems)} frames could not be used; the first: {counts.problems[0]}", err=True)
     for path in counts.files:
@@ -175,7 +180,7 @@ def track(
         raise ImageError(
             f"not one frame of {source} could be used: {counts.problems[0] if counts.problems else 'it is empty'}."
         )
-    if not counts.states.get("tracked", 0) + counts.states.get("restarted", 0):
+    if not counts.states.get(TRACKED, 0) + counts.states.get(UNCERTAIN, 0):
         names = ", ".join(m.name for m in meshes)
         raise PromptError(
             f"{names} was found in none of {counts.used} frames: pass --box, --mask or --pose for the first one."
@@ -191,6 +196,7 @@ class _Counts:
         self.used = 0
         self.reliable = 0
         self.states: dict[str, int] = {}
+        self.restarts = 0
         self.problems: list[str] = []
         self.poses: list[NamedPose] = []
         self.files: list[Path] = []
@@ -287,8 +293,21 @@ def _step(trackers: Sequence[Tracker], frame: Frame, counts: _Counts) -> list[Tr
         results = [tracker.step(frame.image, frame.camera, frame.valid) for tracker in trackers]
     for result in results:
         counts.states[result.state] = counts.states.get(result.state, 0) + 1
+        counts.restarts += result.restarted
         counts.reliable += result.reliable
     return results
+
+
+def _state(result: Tracked) -> str:
+    """In words, for people: a restart is said, too."""
+    return f"{result.state} (restarted)" if result.restarted else result.state
+
+
+def _doubt(result: Tracked) -> str:
+    """What is added where a pose is tracked and still not reliable; the other states say it themselves."""
+    from posekit.tracking.tracker import TRACKED
+
+    return " NOT RELIABLE" if result.state == TRACKED and not result.reliable else ""
 
 
 def _line(frame: Frame, name: str, result: Tracked) -> str:
@@ -300,6 +319,7 @@ def _line(frame: Frame, name: str, result: Tracked) -> str:
         **({"file": frame.file} if frame.file else {}),
         "model": name,
         "state": result.state,
+        "restarted": result.restarted,
         "reliable": result.reliable,
         "T_cam_obj": None if pose is None else pose.matrix.tolist(),
         "angle_deg": None if angle is None else math.degrees(angle),
@@ -330,6 +350,7 @@ def _number(name: str, k: int) -> int:
 
 
 def _draw(writer: VideoWriter, frame: Frame, trackers: Sequence[Tracker], results: Sequence[Tracked]) -> None:
+    from posekit.tracking.tracker import UNCERTAIN
     from posekit.visualise import draw
     from posekit.visualise.figures import outlined
 
@@ -337,10 +358,10 @@ def _draw(writer: VideoWriter, frame: Frame, trackers: Sequence[Tracker], result
     picture, told = frame.image, []
     for tracker, result in zip(trackers, results, strict=True):
         angle = "" if result.angle is None else f" {math.degrees(result.angle):.1f} degrees"
-        told.append(f"{tracker.model.name}: {result.state}{angle}{'' if result.reliable else ' NOT RELIABLE'}")
+        told.append(f"{tracker.model.name}: {_state(result)}{angle}{_doubt(result)}")
         if result.T_cam_obj is None:
             continue
-        colour = draw.GREEN if result.reliable else draw.RED
+        colour = draw.YELLOW if result.state == UNCERTAIN else draw.GREEN if result.reliable else draw.RED
         picture = outlined(tracker.renderer, picture, frame.camera, tracker.model, result.T_cam_obj, colour)
         length = 0.6 * float(tracker.model.extents.max())
         picture = draw.axes(picture, frame.camera, result.T_cam_obj, length, tracker.model.center)
@@ -355,7 +376,7 @@ def _recorder(path: Path, trackers: Sequence[Tracker]) -> Iterator[Any]:
     with Recorder(path, [tracker.model for tracker in trackers]) as recorder:
 
         def record(frame: Frame, results: Sequence[Tracked]) -> None:
-            found = [(result.state, result.T_cam_obj, result.angle) for result in results]
+            found = [(_state(result), result.T_cam_obj, result.angle) for result in results]
             recorder.frame(frame.number, frame.image, frame.camera, found)
 
         yield record
@@ -371,7 +392,7 @@ def _bar(sequence: Frames) -> Iterator[Any]:
             nonlocal mean
             mean = seconds if not mean else 0.9 * mean + 0.1 * seconds
             states = " ".join(
-                r.state if r.angle is None else f"{r.state} {math.degrees(r.angle):.1f} deg" for r in results
+                r.state if r.angle is None else f"{_state(r)} {math.degrees(r.angle):.1f} deg" for r in results
             )
             update(advance=1, description=f"{1 / max(mean, 1e-6):.1f} frames/s  {states}")
 

@@ -7,6 +7,7 @@ says beside its place, the keypoint's size and turn, decides whether it is consi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -97,6 +98,12 @@ class FeatureModel:
         keep_arrays(file, arrays | {"plain": np.asarray(plain)})
         return _decoded(raw, points, tips, directions, plain)
 
+    @classmethod
+    def of_views(cls, views: Sequence[tuple[View, Pose]]) -> FeatureModel:
+        """From at least one picture of the object in a known pose. views: each a View, whose mask is where it shows the
+        object and whose depth is the mesh's there, with its ``T_view_ctr``."""
+        return _decoded(*_of_views(views))
+
 
 @dataclass(frozen=True, eq=False)
 class FeaturePose:
@@ -113,11 +120,18 @@ class FeaturePose:
 
 
 class FeatureSearch:
-    """Finds a mesh in photographs by its texture. The mesh's features are made at the first search."""
+    """Finds a mesh in photographs by its texture. features: what is looked for; by default the mesh's, which are made
+    at the first search."""
 
-    def __init__(self, model: ObjectModel, renderer: Renderer, options: FeatureOptions = FeatureOptions()) -> None:
+    def __init__(
+        self,
+        model: ObjectModel,
+        renderer: Renderer,
+        options: FeatureOptions = FeatureOptions(),
+        features: FeatureModel | None = None,
+    ) -> None:
         self.model, self.renderer, self.options = model, renderer, options
-        self._features: FeatureModel | None = None
+        self._features = features
 
     @property
     def features(self) -> FeatureModel:
@@ -376,13 +390,14 @@ def _extracted(model: ObjectModel, renderer: Renderer) -> _Made:
     """From 26 views spread evenly and the six sides."""
     camera = Camera.from_fov(FIELD, SIDE, SIDE)
     poses = centred_poses(model, [*view_rotations(26), *cube_views()], camera)
-    made, counts = [], []
-    for T_view_obj, view in zip(poses, renderer.render(model, poses, camera, light=Light.flat()), strict=True):
-        raw, *places = _of_view(view, T_view_obj @ model.T_obj_ctr)
-        made.append((raw, *places))
-        counts.append(len(raw))
+    drawn = renderer.render(model, poses, camera, light=Light.flat())
+    return _of_views([(view, T @ model.T_obj_ctr) for T, view in zip(poses, drawn, strict=True)])
+
+
+def _of_views(views: Sequence[tuple[View, Pose]]) -> _Made:
+    made = [_of_view(view, T_view_ctr) for view, T_view_ctr in views]
     raw, points, tips, directions = (np.concatenate(each) for each in zip(*made, strict=True))
-    return raw, points, tips, directions, bool(np.median(counts) < PLAIN_BELOW)
+    return raw, points, tips, directions, bool(np.median([len(each[0]) for each in made]) < PLAIN_BELOW)
 
 
 def _of_view(view: View, T_view_ctr: Pose) -> tuple[NDArray[np.uint8], Array, Array, Array]:
@@ -392,7 +407,7 @@ def _of_view(view: View, T_view_ctr: Pose) -> tuple[NDArray[np.uint8], Array, Ar
     image = view.image.copy()
     image[~view.mask] = np.median(image[view.mask], axis=0)  # so that the outline is no strong edge of the texture
     at, tips, raw = _sift(image, OF_VIEW)
-    whole = np.rint(at).astype(int).clip(0, SIDE - 1)
+    whole = np.rint(at).astype(int).clip(0, np.array(view.camera.size) - 1)
     inside = cv2.distanceTransform(view.mask.astype(np.uint8), cv2.DIST_L2, 5)[whole[:, 1], whole[:, 0]]
     kept = inside > np.maximum(1.5, 0.5 * np.linalg.norm(tips, axis=1))
     at, tips, whole, raw = at[kept], tips[kept], whole[kept], raw[kept]

@@ -10,15 +10,16 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from threading import Lock
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from posekit.align.colour_edge import Colours, Tint, contrast, learn, like_mesh, off_colour, outline_lines
-from posekit.align.gauss_newton import GaussianPose, Points, Residual, fuse
+from posekit.align.gauss_newton import GaussianPose, Lines, Points, Residual, fuse
 from posekit.camera import Camera
 from posekit.errors import CameraError, ConfigError
 from posekit.estimate.estimator import PoseEstimator, nearest_to
@@ -29,11 +30,13 @@ from posekit.mesh.model import ObjectModel
 from posekit.nets.pose_delta import apply_delta
 from posekit.nets.precision import usable_cores
 from posekit.nets.predictor import PairPrediction, Predictor
-from posekit.results import Branch, Detection, Estimate
+from posekit.results import Branch, Detection, Estimate, Source
+from posekit.tracking.memory import Memory, distinct
 from posekit.tracking.points import Keyframe, follow_points, match_texture
 from posekit.view import View
+from posekit.zoom import zoom_to_pose
 
-TRACKED, RESTARTED, LOST = "tracked", "restarted", "lost"
+TRACKED, UNCERTAIN, LOST = "tracked", "uncertain", "lost"
 MASKS, MOTIONS, RUNTIMES = ("colours", "pose", "none"), ("points", "velocity", "none"), ("openvino", "torch")
 NEAR = 0.6  # diameters, the least distance of an object's centre that is accepted
 # standard deviations of a turn in degrees, a shift in pixels of the crop, and a depth in shares of the distance
@@ -52,6 +55,26 @@ TINT_RATE = 0.15  # weight of a frame in the running tint
 COARSE = 1500  # of the mesh that is drawn where the outline is looked for in smaller crops
 FACES = 6000  # of the mesh that is drawn: a crop shows no more
 LEAST_SCALE, KNEE = 0.5, 2.5  # pixels, no correspondence is more exact; standard deviations
+
+
+# of a lost object that is looked for by memory: standard deviations as above of where it is looked for; candidates by
+# colours, and those that are compared; the contrast of its silhouette as a share of what it was when it was followed
+REGAINED = (15.0, 12.0, 0.15)
+CANDIDATES, COMPARED, LEAST_CONTRAST, PLACE_CONTRAST = 8, 3, 0.7, 0.5
+STEPS = 4  # comparisons of a frame with such a pose at most; one more follows the first that bears it out
+SURE = 0.6  # share of a silhouette with the object's colours from which on a frame is remembered
+
+# what contradicts a pose: less than this share of its outline within NEAR_PX pixels of where the colours put it; less
+# than this share of the first silhouette's contrast; a predicted angle (degrees) and a median distance of the network's
+# correspondences (pixels) above these and above TWICE what they usually are. CONTRADICTED of the four are needed.
+# Chosen on made sequences: docs/decisions/0024
+BORNE_OUT, NEAR_PX, LESS_CONTRAST, WIDE_DEG, WIDE_PX, TWICE = 0.5, 1.5, 0.7, 10.0, 1.5, 2.0
+CONTRADICTED, USUAL_RATE = 2, 0.1
+# what `Tracker._recalled` changes
+FOLLOWED = ("_state", "_before", "_colours", "_tint", "_motion", "_doubts", "_separated", "_separated_first", "_bias",
+            "_waiting", "_contradictions", "_contradicted")  # fmt: skip
+
+_ONE_SEARCH = Lock()  # detectors and estimators are shared by trackers, and searches take a core each
 
 
 class Finder(Protocol):
@@ -93,6 +116,13 @@ class TrackConfig:
     least_inside: float = 0.3  # share of the silhouette's box in the picture, likewise
     doubts: int = 3  # frames in doubt in a row after which the object is lost
     search: int = 5  # frames between two attempts to find it
+    # whether a lost object is searched beside the loop, in a thread, so that no frame waits for a search; which frame
+    # it is found in then depends on the machine's speed. search_share: the share of the time that is searched then, at
+    # most. search_age: seconds after which a found pose is too old to be brought to the newest frame
+    search_beside: bool = False
+    search_share: float = 0.5
+    search_age: float = 10.0
+    remember: bool = True  # whether views of the followed object are kept, and a lost one is looked for by them
     runtime: str = "openvino"  # of the network
 
     def __post_init__(self) -> None:
@@ -105,6 +135,8 @@ class TrackConfig:
             raise ConfigError("iterations, doubts and search are at least 1.")
         if not all(0 <= share <= 1 for share in (self.prior, self.min_colour_share, self.learn, self.least_inside)):
             raise ConfigError("prior, min_colour_share, learn and least_inside are shares between 0 and 1.")
+        if not 0 < self.search_share <= 1 or not self.search_age > 0:
+            raise ConfigError("search_share is a share above 0, at most 1, and search_age is above 0 seconds.")
         if not 0 < self.keep <= 1:
             raise ConfigError(f"keep is a share above 0, at most 1, not {self.keep:g}.")
         for name, known in (("mask", MASKS), ("motion", MOTIONS), ("runtime", RUNTIMES)):
@@ -114,11 +146,17 @@ class TrackConfig:
 
 @dataclass(frozen=True, eq=False)
 class Tracked:
-    """The result for a frame. state: "tracked", "restarted" (a new first pose) or "lost". estimate: None
-    where it is lost; its score is the share of its silhouette that has the object's colours."""
+    """The result for a frame.
+
+    state: "tracked" (the picture bears the pose out), "uncertain" (the pose is a prediction: what the picture shows is
+    too little to tell, or contradicts it) or "lost" (no pose). estimate: None where it is lost; its score is the share
+    of its silhouette that has the object's colours. restarted: whether this is the first frame after a search rather
+    than a continuation of the last frame's pose.
+    """
 
     state: str
     estimate: Estimate | None = None
+    restarted: bool = False
 
     @property
     def T_cam_obj(self) -> Pose | None:
@@ -127,8 +165,9 @@ class Tracked:
 
     @property
     def reliable(self) -> bool:
-        """Whether there is an estimate that can be used."""
-        return self.estimate is not None and self.estimate.reliable
+        """Whether the pose can be used: it is tracked, and its score and predicted angle are those of a reliable
+        estimate."""
+        return self.state == TRACKED and self.estimate is not None and self.estimate.reliable
 
     @property
     def angle(self) -> float | None:
@@ -141,8 +180,8 @@ class Tracker:
 
     camera: of all frames, unless `step` is given another. pose: ``T_cam_obj`` in the first frame, where it is known.
     estimator: of this model; made with the shipped weights where it is not given. detector: finds the object in the
-    first frame and when it is lost; without one a lost object stays lost. predictor: in place of the one that
-    ``config.runtime`` names.
+    first frame and when it is lost; without one a lost object is looked for only by what was seen of it while it was
+    followed. predictor: in place of the one that ``config.runtime`` names.
     Not thread-safe: one tracker per thread. Raises ConfigError where neither pose nor detector is given.
     """
 
@@ -175,10 +214,18 @@ class Tracker:
         self._colours: Colours | None = None
         self._tint: Tint | None = None
         self._doubts = 0
+        self._contradictions = self._contradicted = 0  # of the last frame; frames in a row that are contradicted
+        self._usual = (0.0, 0.0)  # radians and pixels: the network's angle and its correspondences' distance
         self._separated = self._separated_first = 0.0  # contrast of the last silhouette and of the first
         self._grown = dict.fromkeys({1, *config.scales}, 0.0)  # pixels, see `_growth`
         self._bias = 0.0  # pixels of the crop: how far the network alone has been from what all evidence gave
         self._waiting = 0  # frames until the next search
+        self._memory = Memory(model, self.renderer)
+        self._known: _Known | None = None
+        self._place: Pose | None = None  # ``T_cam_obj``, where a search's frame has the object's colours
+        self._searching: Future[Tracked] | None = None  # of a search beside the loop
+        self._searcher: ThreadPoolExecutor | None = None
+        self._search_began = self._search_next = 0.0  # seconds of time.monotonic
 
     def step(
         self, image: NDArray[np.uint8], camera: Camera | None = None, valid: NDArray[np.bool_] | None = None
@@ -196,15 +243,22 @@ class Tracker:
                 assert self._before is not None
                 prediction, network = self._compared(self._before.seen, self._before.drawn, self._before.visible)
                 self._bias = self._disagreement(self._before, prediction, self._before.T_view_ctr)
+                self._usual = prediction.angle, self._distance(self._before, prediction, self._before.T_view_ctr)
                 timings = {"network": network, "total": time.perf_counter() - started}
                 given = self._estimate(view, pose, prediction.angle, 0, 1.0, timings)
                 return Tracked(TRACKED, self._on_branch(given, Branch.GIVEN))
-        if self._state is not None:
+        if self._state is not None and self._searching is None:  # a search has the state to itself
             found = self._follow(view, self._state)
-            if found is not None and not self._is_lost(view, found):
-                return Tracked(TRACKED, self._on_branch(found))
+            if found is not None:
+                state = self._judged(view, found)
+                if state == TRACKED:
+                    self._remember(view, found)
+                elif state == UNCERTAIN and (better := self._better(view)) is not None:
+                    return Tracked(TRACKED, self._on_branch(better), restarted=True)
+                if state != LOST:
+                    return Tracked(state, self._on_branch(found))
             self._reset()
-        return self._find(view)
+        return self._find_beside(view) if self.config.search_beside else self._find(view)
 
     # --- following ---
 
@@ -246,11 +300,18 @@ class Tracker:
 
     def _follow(self, view: View, last: GaussianPose) -> Estimate | None:
         """From where the object is expected; None where it cannot be compared."""
-        started, network, angle, comparisons = time.perf_counter(), 0.0, 0.0, 0
-        before, colours, tint = self._before, self._colours, self._tint
-        assert before is not None and colours is not None and tint is not None
+        started = time.perf_counter()
+        before, colours = self._before, self._colours
+        assert before is not None and colours is not None
         predicted = self._outlined(view, self._predicted(view, before, last, colours), last, colours)
-        state = predicted
+        return self._measured(view, predicted, last.pose, started)
+
+    def _measured(self, view: View, predicted: GaussianPose, last: Pose, started: float) -> Estimate | None:
+        """From an expected ``T_cam_ctr``; None where it cannot be compared. last: ``T_cam_ctr`` in the frame before.
+        started: in seconds of time.perf_counter."""
+        network, angle, comparisons = 0.0, 0.0, 0
+        colours, tint, state = self._colours, self._tint, predicted
+        assert colours is not None and tint is not None
         while comparisons < self.config.iterations:
             comparisons += 1
             pose = state.pose @ self.model.T_ctr_obj
@@ -284,9 +345,10 @@ class Tracker:
         assert drawn.mask is not None
         shown = drawn.mask & seen.shown
         share = float((visible & shown).sum() / max(1, shown.sum()))
-        self._motion = Pose(state.pose.R @ last.pose.R.T, state.pose.t - last.pose.t)
+        self._motion = Pose(state.pose.R @ last.R.T, state.pose.t - last.t)
         self._state, self._before = state, keyframe
         self._separated = contrast(seen, drawn.mask, colours)
+        self._contradictions = self._contradicting(keyframe, prediction, more, there)
         if (
             angle < math.radians(self.config.restart_deg) or self._outline_holds()
         ) and share > self.config.min_colour_share:
@@ -294,6 +356,42 @@ class Tracker:
         self._tint = new_tint
         timings = {"network": network, "total": time.perf_counter() - started}
         return self._estimate(view, pose, angle, comparisons, share, timings)
+
+    def _contradicting(
+        self, keyframe: Keyframe, prediction: PairPrediction, more: Sequence[Residual], T_view_ctr: Pose
+    ) -> int:
+        """How many kinds of evidence contradict a pose: outline, colours, the network's angle and its correspondences.
+        The network is believed as far as it has agreed before: on a mesh without colours it never does."""
+        near = [
+            np.abs(((keyframe.drawn.camera.project(T_view_ctr.apply(r.points)) - r.places) * r.normals).sum(axis=1))
+            for r in more
+            if isinstance(r, Lines)
+        ]
+        borne_out = sum(int((each < NEAR_PX).sum()) for each in near) / max(1, len(keyframe.outline[0]))
+        distance, (usual_angle, usual_distance) = self._distance(keyframe, prediction, T_view_ctr), self._usual
+        kinds = (
+            self.config.outline and borne_out < BORNE_OUT,
+            self._separated < LESS_CONTRAST * self._separated_first,
+            prediction.angle > max(math.radians(WIDE_DEG), TWICE * usual_angle),
+            distance > max(WIDE_PX, TWICE * usual_distance),
+        )
+        count = sum(kinds)
+        if count < CONTRADICTED:
+            self._usual = (
+                usual_angle + USUAL_RATE * (prediction.angle - usual_angle),
+                usual_distance + USUAL_RATE * (distance - usual_distance),
+            )
+        return count
+
+    def _distance(self, keyframe: Keyframe, prediction: PairPrediction, T_view_ctr: Pose) -> float:
+        """The median distance, pixels, of the network's correspondences from where a pose puts them; 0 without any."""
+        found, drawn = prediction.correspondences, keyframe.drawn
+        if found is None or not len(found.source):
+            return 0.0
+        assert drawn.coords is not None
+        points = drawn.coords[found.source[:, 1], found.source[:, 0]] - self.model.center
+        there = drawn.camera.project(T_view_ctr.apply(points.astype(np.float64)))
+        return float(np.median(np.linalg.norm(there - found.target, axis=1)))
 
     def _predicted(self, view: View, before: Keyframe, last: GaussianPose, colours: Colours) -> GaussianPose:
         """Where the object is expected, as ``T_cam_ctr``: from the last frame, without a comparison with the mesh."""
@@ -460,8 +558,9 @@ class Tracker:
 
     # --- losing and finding ---
 
-    def _is_lost(self, view: View, found: Estimate) -> bool:
-        """Whether too little of the object has been seen for too long; at once where it is outside the picture."""
+    def _judged(self, view: View, found: Estimate) -> str:
+        """The state of a frame that was followed: uncertain where the evidence is missing or contradicts, lost where it
+        has been so for too long, and at once where the object is outside the picture."""
         x0, y0, x1, y1 = found.box
         width, height = view.camera.size
         inside = max(0.0, min(x1, width) - max(x0, 0.0)) * max(0.0, min(y1, height) - max(y0, 0.0))
@@ -472,7 +571,11 @@ class Tracker:
             or (math.degrees(found.angle) > self.config.restart_deg and not self._outline_holds())
         )
         self._doubts = self._doubts + 1 if in_doubt else 0
-        return share == 0 or self._doubts >= self.config.doubts
+        contradicted = self._contradictions >= CONTRADICTED
+        self._contradicted = self._contradicted + 1 if contradicted else 0
+        if share == 0 or self._doubts >= self.config.doubts:
+            return LOST
+        return UNCERTAIN if in_doubt or contradicted else TRACKED
 
     def _outline_holds(self) -> bool:
         """Whether the last frame's silhouette separates the colours at least half as well as the first one's did.
@@ -484,21 +587,167 @@ class Tracker:
     def _reset(self) -> None:
         self._state = self._before = self._colours = None
         self._motion, self._doubts, self._waiting = Pose.identity(), 0, 0
+        self._contradictions = self._contradicted = 0
+
+    def _remember(self, view: View, found: Estimate) -> None:
+        """What is known of the object in a frame that is tracked."""
+        state, before = self._know()
+        sure = found.score > SURE and (math.degrees(found.angle) < self.config.restart_deg or self._outline_holds())
+        T_view_ctr = Pose.rotation(before.seen.R_view_cam) @ state.pose
+        if self.config.remember and sure and self._memory.wants(T_view_ctr):
+            self._memory.keep(view, before, T_view_ctr)
+
+    def _better(self, view: View) -> Estimate | None:
+        """What memory finds when a pose has been contradicted for some frames; where it finds nothing that is borne
+        out, the pose is followed further."""
+        late = self._contradicted - self.config.doubts
+        if self.config.search_beside or late < 0 or late % self.config.search:
+            return None
+        kept = {name: getattr(self, name) for name in FOLLOWED}
+        found = self._recalled(view)
+        if found is None:
+            for name, value in kept.items():
+                setattr(self, name, value)
+        return found
+
+    def _know(self) -> tuple[GaussianPose, Keyframe]:
+        """Keep what the last frame tells."""
+        state, before, colours, tint = self._state, self._before, self._colours, self._tint
+        assert state is not None and before is not None and colours is not None and tint is not None
+        self._known = _Known(state.pose, colours, tint, self._separated_first)
+        return state, before
 
     def _find(self, view: View) -> Tracked:
-        """A new first pose, where there is one. A search takes seconds, so not every frame is searched."""
+        """A new first pose, where there is one. A search takes time, so not every frame is searched."""
         self._waiting -= 1
-        if self.detector is None or self._waiting > 0:
+        if self._waiting > 0:
             return Tracked(LOST)
         self._waiting = self.config.search
+        found = self._searched(view)
+        if found.state != LOST:
+            self._waiting = 0
+        return found
+
+    def _find_beside(self, view: View) -> Tracked:
+        """The same without waiting for the search, which has a frame of its own."""
+        if self._searching is None:
+            if time.monotonic() >= self._search_next:
+                self._searcher = self._searcher or ThreadPoolExecutor(1, "posekit-search")
+                self._search_began = time.monotonic()
+                self._searching = self._searcher.submit(self._searched, view)
+            return Tracked(LOST)
+        if not self._searching.done():
+            return Tracked(LOST)
+        answer, self._searching = self._searching, None
+        now = time.monotonic()
+        self._search_next = now + (now - self._search_began) * (1 / self.config.search_share - 1)
+        found = answer.result()
+        if found.estimate is None or now - self._search_began > self.config.search_age:
+            self._reset()
+            return Tracked(LOST)
+        return self._brought_on(view, found.estimate)
+
+    def _brought_on(self, view: View, found: Estimate) -> Tracked:
+        """A pose that was found in an earlier frame, in the newest one."""
+        self._know()
+        there = self._regained(view, [found.T_cam_obj])
+        there = there or self._regained(view, self._by_colours(view))
+        if there is None:
+            self._reset()
+            return Tracked(LOST)
+        return Tracked(TRACKED, self._on_branch(there), restarted=True)
+
+    def _searched(self, view: View) -> Tracked:
+        """By memory, else by the detector. It is tracked from then on where it is found."""
+        with _ONE_SEARCH:
+            found = self._recalled(view) or self._at_colours(view) or self._detected(view)
+        return Tracked(LOST) if found is None else Tracked(TRACKED, self._on_branch(found), restarted=True)
+
+    def _recalled(self, view: View) -> Estimate | None:
+        """Where views that were kept, and colours that were learned, lead to."""
+        self._place = None
+        if not self.config.remember or self._known is None:
+            return None
+        last = self._known.T_cam_ctr @ self.model.T_ctr_obj
+        found = self._regained(view, self._memory.by_features(view))
+        return found or self._regained(view, [last, *self._by_colours(view)])
+
+    def _at_colours(self, view: View) -> Estimate | None:
+        """What a search of the mesh's views finds where the frame has the object's colours: it may have turned."""
+        if self._place is None:
+            return None
+        box = view.camera.points_box(_before_camera(self._place.apply(self.model.hull_vertices)))
+        place, self._place = Detection(box, None, 1.0, self.model.name, Source.BOX), None
+        poses = [each.T_cam_obj for each in self.estimator.estimate(view, [place], SURE)]
+        return self._regained(view, poses)
+
+    def _by_colours(self, view: View) -> list[Pose]:
+        assert self._known is not None
+        found = self._memory.by_colours(view, self._known.colours, self._known.T_cam_ctr, CANDIDATES)
+        return distinct(found, self.model)
+
+    def _regained(self, view: View, candidates: Sequence[Pose]) -> Estimate | None:
+        """The first of the ``T_cam_obj``, fitted to the frame, that the evidence bears out; it is followed from then
+        on. Those are compared whose silhouette separates the known colours best."""
+        known = self._known
+        assert known is not None
+        fitted = []
+        for pose in candidates:
+            if not self._in_front(pose):
+                continue
+            centred = pose @ self.model.T_obj_ctr
+            camera = self._crop_camera(view, pose)
+            start = self._aligned(view, _about(centred, camera, REGAINED), known.colours, self.config.scales)
+            fitted.append((self._separation(view, start.pose, known.colours), start))
+        fitted.sort(key=lambda each: -each[0])
+        self._place = None
+        if fitted and fitted[0][0] > max(CLEAR, PLACE_CONTRAST * known.separated):
+            self._place = fitted[0][1].pose @ self.model.T_ctr_obj
+        for quality, start in fitted[:COMPARED]:
+            if quality < max(CLEAR, LEAST_CONTRAST * known.separated):
+                break
+            self._colours, self._tint, self._separated_first = known.colours, known.tint, known.separated
+            self._doubts, started, borne_out = 0, time.perf_counter(), False
+            for _ in range(STEPS):
+                found = self._measured(view, start, start.pose, started)
+                if found is None or borne_out:
+                    break
+                borne_out = self._judged(view, found) == TRACKED and found.score > SURE
+                assert self._state is not None
+                start = _about(self._state.pose, self._crop_camera(view, found.T_cam_obj), PREDICTED)
+            if found is not None and borne_out and self._judged(view, found) == TRACKED:
+                self._motion = Pose.identity()
+                return found
+            self._reset()
+        return None
+
+    def _crop_camera(self, view: View, pose: Pose) -> Camera:
+        return zoom_to_pose(view.camera, pose @ self.model.T_obj_ctr, self._outline, self.predictor.size).camera
+
+    def _detected(self, view: View) -> Estimate | None:
+        """What the detector and a search of the mesh find."""
+        if self.detector is None:
+            return None
         detections = self.detector.detect(view, [self.model])
         # a person's word for the first frame is taken; later detections may be wrong, whatever the detector
         options = SearchOptions.usual(detections) if self._last_pose is None else SearchOptions()
         [found] = find_instances(lambda _: self.estimator, view, [self.model], detections, options)
         if not found.instances or not self._begin(view, found.instances[0].T_cam_obj, found.instances[0].angle):
-            return Tracked(LOST)
-        self._waiting = 0
-        return Tracked(RESTARTED, self._on_branch(found.instances[0]))
+            return None
+        _, before = self._know()
+        if self.config.remember and not self._memory.views:
+            self._memory.keep(view, before, before.T_view_ctr)
+        return found.instances[0]
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """Of the last frame that was tracked. separated: contrast of a silhouette in its place."""
+
+    T_cam_ctr: Pose
+    colours: Colours
+    tint: Tint
+    separated: float
 
 
 def _about(pose: Pose, camera: Camera, spread: tuple[float, float, float]) -> GaussianPose:

@@ -22,6 +22,7 @@ WHITE: Colour = (255, 255, 255)
 BLACK: Colour = (0, 0, 0)
 PAPER: Colour = (24, 26, 30)  # behind tiles
 GREEN: Colour = (64, 255, 96)  # what was found
+YELLOW: Colour = (255, 235, 60)  # what is predicted, and not borne out by the picture
 RED: Colour = (255, 60, 60)  # what was found, but is not reliable
 ORANGE: Colour = (255, 170, 30)  # what was given
 AXES: tuple[Colour, Colour, Colour] = ((255, 70, 70), (80, 230, 80), (80, 140, 255))  # x, y, z
