@@ -73,7 +73,7 @@ def test_help_loads_nothing_heavy() -> None:
 
 
 def test_help_is_asked_of_every_command() -> None:
-    names = "cache calibrate demo detect doctor download estimate eval refine render-views synth track train view"
+    names = "cache calibrate demo detect doctor download estimate eval export refine render-views synth track train view"
     assert sorted(get_command(app).commands) == names.split()  # type: ignore[attr-defined]
 
 
