@@ -23,7 +23,7 @@ from posekit.nets.weights import Networks
 FORMATS = ("onnx", "openvino")
 INPUTS = ("observed", "rendered", "relief", "focal")
 OUTPUTS = ("quat_wxyz", "v", "angle", "flow", "log_scale", "visibility", "certainty", "silhouettes", "score")
-BOUND = 1e-3  # the largest difference, of the larger of 1 and the largest value of an output
+BOUND = 3e-3  # the largest difference, of the larger of 1 and the largest value of an output
 BATCHES = (1, 3)  # that are compared
 _OPSET = 18
 _TRACED = 2  # pairs of the batch that is traced: of one, some operations would be left out

@@ -89,7 +89,8 @@ class Exchange(nn.Module):
         B, C, h, w = x.shape
         cells = x.permute(0, 2, 3, 1).reshape(B, h * w, C)
         q, k, v = self.project(self.norm(cells)).unflatten(2, (3, self.heads, -1)).transpose(1, 3).unbind(2)
-        other = [t.unflatten(0, (2, -1)).flip(0).flatten(0, 1) for t in (k, v)]  # (2B, heads, h * w, C / heads), of the other crop
+        # of the other crop, (2B, heads, h * w, C / heads)
+        other = [t.unflatten(0, (2, -1)).flip(0).flatten(0, 1) for t in (k, v)]
         found = attention(q, *other).transpose(1, 2).reshape(B, h * w, C)
         return (cells + self.join(found)).reshape(B, h, w, C).permute(0, 3, 1, 2)
 

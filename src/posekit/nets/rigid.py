@@ -18,7 +18,7 @@ DAMPING = 1e-2  # of the normal equations' diagonal
 @dataclass(frozen=True, eq=False)
 class Surface:
     """The rendered surface at N anchors in B crops. points: (B, N, 3), along the view's axes, mean depth 1.
-    anchors: (B, N, 2), where they are drawn, in pixels from the principal point. focal: (B,), pixels."""
+    anchors: (1, N, 2), where they are drawn, in pixels from the principal point. focal: (B,), pixels."""
 
     points: Tensor
     anchors: Tensor
@@ -27,10 +27,10 @@ class Surface:
     @classmethod
     def of(cls, relief: Tensor, focal: Tensor, step: int, first: float) -> Surface:
         """relief: (B, h, w) of every ``step``-th pixel from ``first`` on. focal: (B,), in widths of the crop."""
-        B, h, w = relief.shape
+        h, w = relief.shape[1:]
         ys, xs = torch.meshgrid(*(torch.arange(n, device=relief.device) for n in (h, w)), indexing="ij")
         x, y = xs * step + first - 0.5 * (w * step - 1), ys * step + first - 0.5 * (h * step - 1)
-        anchors = torch.stack([x, y], dim=-1).view(1, h * w, 2).expand(B, -1, -1)
+        anchors = torch.stack([x, y], dim=-1).view(1, h * w, 2)
         depth = (1 + relief / focal[:, None, None]).flatten(1)[..., None]
         pixels = focal * w * step
         return cls(torch.cat([anchors / pixels[:, None, None] * depth, depth], dim=2), anchors, pixels)
@@ -68,7 +68,7 @@ def solve_motion(surface: Surface, flow: Tensor, weight: Tensor, steps: int = 3)
 
     The gradient passes through the last step alone: at the optimum that is the whole of it.
     """
-    motion = Motion.none(flow)
+    motion = Motion.none(flow[:1])  # broadcast, so that a traced graph holds for any batch
     for k in range(steps):
         last = k == steps - 1
         with torch.set_grad_enabled(last and torch.is_grad_enabled()), torch.autocast(flow.device.type, enabled=False):
