@@ -158,7 +158,7 @@ def _write_onnx(module: nn.Module, inputs: tuple[Tensor, ...], folder: Path) -> 
         kind = torch.float64 if x.type().scalarType() == "Double" else torch.float32
         return graph.op("Sub", graph.op("Exp", x), graph.op("Constant", value_t=torch.tensor(1.0, dtype=kind)))
 
-    torch.onnx.register_custom_op_symbolic("aten::expm1", expm1, _OPSET)  # type: ignore[no-untyped-call]
+    torch.onnx.register_custom_op_symbolic("aten::expm1", expm1, _OPSET)  # type: ignore[attr-defined]
     file = folder / "svnet.onnx"
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
