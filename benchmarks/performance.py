@@ -200,6 +200,33 @@ def estimating(frames: Frames) -> str:
     return text + table(["", "median, s", "largest, s", "memory, GB"], rows)
 
 
+def beside(frames: Frames, repeats: int) -> str:
+    """Estimating alone and beside two processes that never wait, in turn, all at the same niceness."""
+    view, model, detection, _ = frames.get(0)
+    estimator, seconds = PoseEstimator(model), ([], [])  # type: tuple[list[float], list[float]]
+    estimator.estimate(view, [detection])  # what is made once per mesh
+    for _ in range(repeats):
+        for count, took in zip((0, 2), seconds, strict=True):
+            busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+            try:
+                time.sleep(0.5)  # until they have started
+                started = time.perf_counter()
+                estimator.estimate(view, [detection])
+                took.append(time.perf_counter() - started)
+                if any(each.poll() is not None for each in busy):
+                    raise SystemExit("a process that was to be busy has ended")
+            finally:
+                for each in busy:
+                    each.kill()
+                    each.wait()
+    alone, crowded = (median(each) for each in seconds)
+    rows = [["alone", f"{alone:.2f}", f"{max(seconds[0]):.2f}", ""],
+            ["beside two busy processes", f"{crowded:.2f}", f"{max(seconds[1]):.2f}",
+             f"{crowded / alone:.1f} times"]]  # fmt: skip
+    text = f"Warm, from a box, {repeats} estimates of one picture each way, in turn; the bound is 3 times.\n\n"
+    return text + table(["", "median, s", "largest, s", "of alone"], rows)
+
+
 def scoring(frames: Frames, poses: int) -> str:
     _, model, _, _ = frames.get(0)
     rng, noise, points = np.random.default_rng(0), PoseNoise(5.0, 15.0, (0.005, 0.005, 0.02)), model.vertices
@@ -304,20 +331,25 @@ def main() -> None:
     parser.add_argument("--pyrender", metavar="PYTHON")
     parser.add_argument("--quick", action="store_true", help="without the mesh of 2 million faces")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent.parent / "docs" / "performance.md")
+    parser.add_argument("--only", action="append", metavar="SECTION", help="a section's title, printed; repeat it")
     args = parser.parse_args()
     about, frames = machine(), Frames(args.root, args.frames)
     sections: dict[str, Callable[[], str]] = {
         "Rendering": lambda: rendering(frames, args.repeats, args.pyrender),
         "One refine iteration": lambda: iteration(frames, args.repeats),
         "Estimating from a box": lambda: estimating(frames),
+        "Beside busy processes": lambda: beside(frames, args.repeats),
         "Scoring": lambda: scoring(frames, args.poses),
         "Growth": lambda: growth(frames, args.repeats, args.quick),
     }
+    if args.only is not None:
+        sections = {title: section for title, section in sections.items() if title in args.only}
     text = f"# Performance\n{about}\n"
     for title, section in sections.items():
         print(f"{title} ...", file=sys.stderr)
         text += f"\n## {title}\n{section()}\n"
-    args.out.write_text(text, encoding="utf-8")
+    if args.only is None:
+        args.out.write_text(text, encoding="utf-8")
     print(text)
 
 

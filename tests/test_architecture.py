@@ -50,6 +50,8 @@ DOORS = {
     "viser": {"viewer"},
     "websockets": {"viewer"},
     "openvino": {"nets", "cli"},
+    "onnx": {"nets"},
+    "onnxruntime": {"nets"},
     "supervision": {"detect"},
 }
 

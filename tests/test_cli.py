@@ -73,8 +73,8 @@ def test_help_loads_nothing_heavy() -> None:
 
 
 def test_help_is_asked_of_every_command() -> None:
-    names = "cache calibrate demo detect doctor download estimate eval refine render-views synth track train view"
-    assert sorted(get_command(app).commands) == names.split()  # type: ignore[attr-defined]
+    names = "cache calibrate demo detect doctor download estimate eval export refine render-views synth track train"
+    assert sorted(get_command(app).commands) == [*names.split(), "view"]  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("command", sorted(get_command(app).commands))  # type: ignore[attr-defined]

@@ -543,3 +543,69 @@ def test_triton_is_loaded_before_opengl_starts(tmp_path, monkeypatch) -> None:
     with pytest.raises(RenderError):
         info()
     assert order[:2] == [str(library), "OpenGL"]
+
+
+def pebble(seed: int = 2) -> ObjectModel:
+    """A closed, bumpy surface whose faces all go the same way round, without colours of its own."""
+    theta, phi = np.meshgrid(np.linspace(0, np.pi, 25), np.linspace(0, 2 * np.pi, 48, endpoint=False), indexing="ij")
+    unit = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1).reshape(-1, 3)
+    waves = np.random.default_rng(seed).normal(0, 4, (3, 3))
+    bumps = 0.1 * np.sin(unit @ waves).sum(axis=1)
+    index = np.arange(len(unit)).reshape(25, 48)
+    a, b = index[:-1], index[1:]
+    c, d = np.roll(a, -1, axis=1), np.roll(b, -1, axis=1)
+    faces = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)]).reshape(-1, 3)
+    return ObjectModel.from_arrays(0.05 * unit * (1 + bumps)[:, None], faces)
+
+
+@pytest.mark.parametrize("inside_out", [False, True])
+def test_leaving_out_the_faces_behind_changes_no_picture(inside_out) -> None:
+    model = pebble()
+    if inside_out:
+        model = ObjectModel.from_arrays(model.vertices, model.faces[:, ::-1])
+    renderer, rng = Renderer(), np.random.default_rng(1)
+    poses = [Pose(random_rotation(rng), [*rng.uniform(-0.02, 0.02, 2), rng.uniform(0.12, 0.4)]) for _ in range(20)]
+    fewer = renderer.render(model, poses, CAMERA)
+    mesh = renderer._meshes[model]
+    assert mesh.culled
+    mesh.culled = False
+    for one, other in zip(fewer, renderer.render(model, poses, CAMERA), strict=True):
+        np.testing.assert_array_equal(one.mask, other.mask)
+        assert (np.abs(one.depth - other.depth) > 1e-6).sum() <= 2  # at the outline, faces seen edge-on
+        assert (one.image != other.image).any(axis=-1).sum() <= 2
+
+
+def test_meshes_whose_faces_go_different_ways_round_are_drawn_whole(renderer) -> None:
+    whole = pebble()
+    lid = ObjectModel.from_arrays(whole.vertices, whole.faces[48:])  # open
+    flipped = whole.faces.copy()
+    flipped[100:110] = flipped[100:110, ::-1]
+    shifted = whole.vertices + np.array([0.2, 0, 0], np.float32)
+    faces = np.concatenate([whole.faces, whole.faces[:, ::-1] + len(whole.vertices)])  # the second one inside out
+    two = ObjectModel.from_arrays(np.concatenate([whole.vertices, shifted]), faces)
+    for model in (lid, ObjectModel.from_arrays(whole.vertices, flipped), two):
+        renderer.render(model, [Pose(np.eye(3), [0, 0, 0.4])], CAMERA)
+        assert not renderer._meshes[model].culled
+    [view] = renderer.render(two, [Pose(np.eye(3), [-0.2, 0, 0.4])], CAMERA)
+    [alone] = renderer.render(whole, [Pose(np.eye(3), [0, 0, 0.4])], CAMERA)
+    assert alone.mask.sum() > 500
+    assert (view.mask != alone.mask)[:, 35:105].sum() <= 3  # the first one stands beside
+    assert np.abs(view.depth - alone.depth)[:, 35:105].max() < 0.01
+
+
+def test_from_inside_a_closed_mesh_its_walls_are_seen(renderer) -> None:
+    model = pebble()
+    [view] = renderer.render(model, [Pose(np.eye(3), [0, 0, 0])], CAMERA)
+    assert renderer._meshes[model].culled
+    assert view.mask.all()
+
+
+def test_more_views_than_are_drawn_ahead_equal_single_ones(renderer) -> None:
+    model, rng = pebble(), np.random.default_rng(6)
+    poses = [Pose(random_rotation(rng), [0, 0, rng.uniform(0.15, 0.6)]) for _ in range(37)]
+    for samples in (0, 4):
+        chosen = Renderer(samples)
+        for pose, view in zip(poses, chosen.render(model, poses, CAMERA), strict=True):
+            [single] = chosen.render(model, [pose], CAMERA)
+            for name in ("image", "mask", "depth", "coords"):
+                np.testing.assert_array_equal(getattr(view, name), getattr(single, name))

@@ -25,6 +25,7 @@ from posekit.cli import (
     download,
     estimate,
     eval,
+    export,
     refine,
     render_views,
     synth,
@@ -161,6 +162,7 @@ app.add_typer(train.train, name="train")
 app.command("eval", cls=Command)(eval.evaluate)
 app.command("download", cls=Command)(download.download)
 app.command("calibrate", cls=Command)(calibrate.calibrate)
+app.command("export", cls=Command)(export.export)
 app.command("cache", cls=Command)(cache.cache)
 app.command("doctor", cls=Command)(doctor.doctor)
 app.command("demo", cls=Command)(demo.demo)

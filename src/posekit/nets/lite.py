@@ -89,7 +89,8 @@ class Exchange(nn.Module):
         B, C, h, w = x.shape
         cells = x.permute(0, 2, 3, 1).reshape(B, h * w, C)
         q, k, v = self.project(self.norm(cells)).unflatten(2, (3, self.heads, -1)).transpose(1, 3).unbind(2)
-        other = [t.roll([B // 2], [0]) for t in (k, v)]  # (2B, heads, h * w, C / heads), of the other crop
+        # of the other crop, (2B, heads, h * w, C / heads)
+        other = [t.unflatten(0, (2, -1)).flip(0).flatten(0, 1) for t in (k, v)]
         found = attention(q, *other).transpose(1, 2).reshape(B, h * w, C)
         return (cells + self.join(found)).reshape(B, h, w, C).permute(0, 3, 1, 2)
 
@@ -225,10 +226,10 @@ class LiteSVNet(nn.Module):
         B = observed.shape[0]
         mask = rendered[:, 3]
         fine, first = self.tower(torch.cat([observed, rendered[:, :3]]))
-        place = self.place.repeat_interleave(B, 0).to(first.dtype)
+        place = self.place.to(first.dtype)
         shape = [rendered[:, 3:], normals_of(relief, mask), relief[:, None]]
         together, near = self.pair(torch.cat([observed, rendered[:, :3], *shape], dim=1))
-        x = first + place + F.pad(near, (0, 0, 0, 0, 0, 0, B, 0))
+        x = torch.cat([first[:B] + place[0], first[B:] + place[1] + near])
         for block in self.exchange:
             x = block(x)
         x = self.settle(x)

@@ -18,7 +18,7 @@ DAMPING = 1e-2  # of the normal equations' diagonal
 @dataclass(frozen=True, eq=False)
 class Surface:
     """The rendered surface at N anchors in B crops. points: (B, N, 3), along the view's axes, mean depth 1.
-    anchors: (B, N, 2), where they are drawn, in pixels from the principal point. focal: (B,), pixels."""
+    anchors: (1, N, 2), where they are drawn, in pixels from the principal point. focal: (B,), pixels."""
 
     points: Tensor
     anchors: Tensor
@@ -27,11 +27,11 @@ class Surface:
     @classmethod
     def of(cls, relief: Tensor, focal: Tensor, step: int, first: float) -> Surface:
         """relief: (B, h, w) of every ``step``-th pixel from ``first`` on. focal: (B,), in widths of the crop."""
-        B, h, w = relief.shape
+        h, w = relief.shape[1:]
         ys, xs = torch.meshgrid(*(torch.arange(n, device=relief.device) for n in (h, w)), indexing="ij")
         x, y = xs * step + first - 0.5 * (w * step - 1), ys * step + first - 0.5 * (h * step - 1)
-        anchors = torch.stack([x, y], dim=-1).view(1, h * w, 2).expand(B, -1, -1)
-        depth = (1 + relief / focal[:, None, None]).view(B, h * w, 1)
+        anchors = torch.stack([x, y], dim=-1).view(1, h * w, 2)
+        depth = (1 + relief / focal[:, None, None]).flatten(1)[..., None]
         pixels = focal * w * step
         return cls(torch.cat([anchors / pixels[:, None, None] * depth, depth], dim=2), anchors, pixels)
 
@@ -68,7 +68,7 @@ def solve_motion(surface: Surface, flow: Tensor, weight: Tensor, steps: int = 3)
 
     The gradient passes through the last step alone: at the optimum that is the whole of it.
     """
-    motion = Motion.none(flow)
+    motion = Motion.none(flow[:1])  # broadcast, so that a traced graph holds for any batch
     for k in range(steps):
         last = k == steps - 1
         with torch.set_grad_enabled(last and torch.is_grad_enabled()), torch.autocast(flow.device.type, enabled=False):
@@ -78,14 +78,13 @@ def solve_motion(surface: Surface, flow: Tensor, weight: Tensor, steps: int = 3)
 
 def _step(surface: Surface, motion: Motion, flow: Tensor, weight: Tensor) -> Motion:
     arm, p = moved(surface, motion)
-    B, N = weight.shape
     z = p[..., 2].clamp_min(0.1)
     f = surface.focal[:, None] / z
     residual = surface.anchors + flow - p[..., :2] * f[..., None]
     zero = torch.zeros_like(z)
-    to_t = torch.stack([f, zero, -f * p[..., 0] / z, zero, f, -f * p[..., 1] / z], dim=-1).view(B, N, 2, 3)
+    to_t = torch.stack([f, zero, -f * p[..., 0] / z, zero, f, -f * p[..., 1] / z], dim=-1).unflatten(2, (2, 3))
     # d(p)/d(turn) = -[arm]x, row by row of the projection
-    turn = torch.linalg.cross(arm[:, :, None].expand(B, N, 2, 3), to_t, dim=3)
+    turn = torch.linalg.cross(arm[:, :, None].expand(-1, -1, 2, -1), to_t, dim=3)
     J = torch.cat([turn, to_t], dim=3)  # (B, N, 2, 6)
     # the damping needs one scale for turns and shifts: a shift of a mean depth moves points f pixels
     share = weight / weight.sum(1, keepdim=True).clamp_min(1e-6)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from posekit.camera import Camera
 from posekit.errors import RenderError
-from posekit.geometry import Pose
+from posekit.geometry import Pose, fibonacci_sphere, view_rotation
 from posekit.mesh.light import drawn_copy
 from posekit.mesh.model import ObjectModel
 from posekit.render import context
@@ -24,6 +24,9 @@ from posekit.view import View
 
 SAMPLES = (0, 2, 4, 8)
 _TARGETS = 4  # sizes of pictures whose framebuffers are kept
+_AHEAD, _AHEAD_PIXELS = 16, 2**19  # views that are drawn before the first is read, at most so many pixels of them
+_CHECK_DIRECTIONS = fibonacci_sphere(24)
+_CHECK_SIDE, _CHECK_DISTANCE = 64, 5.0  # pixels, of the pictures in which culling is tried, and bounding radii
 
 
 class Renderer:
@@ -41,7 +44,7 @@ class Renderer:
             raise ValueError(f"Renderer: samples={samples}; use one of {SAMPLES}")
         self._backend = backend
         self._meshes: WeakKeyDictionary[ObjectModel, Mesh] = WeakKeyDictionary()
-        self._targets: OrderedDict[tuple[int, int], Target] = OrderedDict()
+        self._targets: OrderedDict[tuple[int, int], list[Target]] = OrderedDict()
         self._programs: dict[tuple[Pass, str], Program] = {}
         with context.current(backend) as current:
             self.samples = min(samples, current.gl.max_samples)
@@ -74,45 +77,47 @@ class Renderer:
         _check_poses(poses)
         size = self._check_size(all_cameras)
         with context.current(self._backend) as current:
-            current.gl.enable_only(moderngl.DEPTH_TEST)
             mesh = self._mesh(current.gl, drawn_copy(model, max(size)))
-            target = self._target(current.gl, size)
-            return [
-                self._view(target, mesh, mesh.draw(pose, camera, each), camera, rgb=rgb, coords=coords)
-                for pose, camera, each in zip(poses, all_cameras, lights, strict=True)
-            ]
+            draws = [mesh.draw(*each) for each in zip(poses, all_cameras, lights, strict=True)]
+            return self._views(current.gl, mesh, draws, all_cameras, rgb=rgb, coords=coords)
 
-    def _view(self, target: Target, mesh: Mesh, draw: Draw | None, camera: Camera, *, rgb: bool, coords: bool) -> View:
-        """Draw and read one view.
+    def _views(
+        self,
+        gl: moderngl.Context,
+        mesh: Mesh,
+        draws: list[Draw | None],
+        cameras: list[Camera],
+        *,
+        rgb: bool,
+        coords: bool,
+    ) -> list[View]:
+        """Draw and read views.
 
-        One at a time and at the framebuffer's corner: as tiles of an atlas, far from the corner, they would be less
-        exact (OpenGL interpolates in float32 window coordinates) and, on a CPU, slower.
+        Several are drawn before the first is read, so that reading and drawing do not wait for each other. Each has a
+        framebuffer of its own: as tiles of one, far from its corner, they would be less exact (OpenGL interpolates in
+        float32 window coordinates), and slower on a CPU, where nearly all time goes into the triangles.
         """
         smooth = rgb and self.samples > 0
-        exact = Pass(colour=rgb and not smooth, coords=coords)
-        self._run(target, exact, mesh, draw)
-        image = np.zeros((camera.height, camera.width, 3), np.uint8)
-        depth = xyz = mask = None
-        if coords:
-            geometry = target.read(exact, "f4")
-            depth, xyz = geometry[..., 3].copy(), _first_three(geometry)
-            mask = depth > 0
-        if exact.colour or not coords:
-            rgba = target.read(exact, "f1")
-            mask = rgba[..., 3] > 0
-            image = _first_three(rgba) if rgb else image
-        if smooth:
-            fine = Pass(colour=True, smooth=True)
-            self._run(target, fine, mesh, draw)
-            image = _first_three(target.read(fine, "f1"))
-        return View(image, camera, mask, depth, xyz)
+        exact, fine = Pass(colour=rgb and not smooth, coords=coords), Pass(colour=True, smooth=True)
+        passes = [exact, fine] if smooth else [exact]
+        width, height = cameras[0].size
+        ahead = min(len(draws), _AHEAD, max(1, _AHEAD_PIXELS // (width * height)))
+        targets = self._framebuffers(gl, (width, height), ahead)
+        views = []
+        for start in range(0, len(draws), ahead):
+            some = list(zip(targets, draws[start : start + ahead], cameras[start : start + ahead], strict=False))
+            for target, draw, _ in some:
+                for pass_ in passes:
+                    self._run(target, pass_, mesh, draw)
+            views += [_read(target, camera, passes, rgb=rgb) for target, _, camera in some]
+        return views
 
     def _run(self, target: Target, pass_: Pass, mesh: Mesh, draw: Draw | None) -> None:
         target.begin(pass_)
         if draw is not None:
             program = self._program(target.gl, pass_, mesh.surface if pass_.colour else "plain")
             program.write(draw)
-            mesh.render(target.gl, program)
+            mesh.render(target.gl, program, draw.outside)
 
     def _program(self, gl: moderngl.Context, pass_: Pass, surface: str) -> Program:
         key = pass_, surface
@@ -124,16 +129,34 @@ class Renderer:
         mesh = self._meshes.get(model)
         if mesh is None:
             mesh = self._meshes[model] = Mesh(gl, model)
+            mesh.culled = mesh.front is not None and self._looks_alike_culled(gl, mesh)
         return mesh
 
-    def _target(self, gl: moderngl.Context, size: tuple[int, int]) -> Target:
-        """The framebuffers for this size; those least recently used make room."""
+    def _looks_alike_culled(self, gl: moderngl.Context, mesh: Mesh) -> bool:
+        """Whether no face that turns its back is seen from outside: tried from all sides. A single pixel may differ:
+        at the outline, where faces are seen edge-on, the nearer of two is a matter of rounding."""
+        camera = Camera.from_fov(0.5, _CHECK_SIDE, _CHECK_SIDE)
+        centre = np.array([0, 0, _CHECK_DISTANCE * mesh.radius])
+        poses = [Pose(view_rotation(direction), centre) @ mesh.T_ctr_obj for direction in _CHECK_DIRECTIONS]
+        draws = [mesh.draw(pose, camera, DEFAULT_LIGHT) for pose in poses]
+        depths = []
+        for mesh.culled in (False, True):
+            views = self._views(gl, mesh, draws, [camera] * len(draws), rgb=False, coords=True)
+            depths.append(np.stack([view.depth for view in views if view.depth is not None]))
+        differ = np.abs(depths[0] - depths[1]) > 1e-2 * mesh.radius
+        beside, below = differ[:, :, 1:] & differ[:, :, :-1], differ[:, 1:] & differ[:, :-1]
+        return not (beside.any() or below.any())
+
+    def _framebuffers(self, gl: moderngl.Context, size: tuple[int, int], count: int) -> list[Target]:
+        """At least so many for this size; sizes least recently used make room."""
         if size not in self._targets:
             while len(self._targets) >= _TARGETS:
                 self._targets.popitem(last=False)
-            self._targets[size] = Target(gl, size, self.samples)
+            self._targets[size] = []
         self._targets.move_to_end(size)
-        return self._targets[size]
+        made = self._targets[size]
+        made += [Target(gl, size, self.samples) for _ in range(count - len(made))]
+        return made
 
     def _check_size(self, cameras: list[Camera]) -> tuple[int, int]:
         sizes = {camera.size for camera in cameras}
@@ -146,6 +169,24 @@ class Renderer:
                 "side. Draw a smaller one (Camera.resized)."
             )
         return size
+
+
+def _read(target: Target, camera: Camera, passes: list[Pass], *, rgb: bool) -> View:
+    """The view that a target's passes have drawn: the exact one, and the smooth one where there is one."""
+    exact = passes[0]
+    image = np.zeros((camera.height, camera.width, 3), np.uint8)
+    depth = xyz = mask = None
+    if exact.coords:
+        geometry = target.read(exact, "f4")
+        depth, xyz = geometry[..., 3].copy(), _first_three(geometry)
+        mask = depth > 0
+    if exact.colour or not exact.coords:
+        rgba = target.read(exact, "f1")
+        mask = rgba[..., 3] > 0
+        image = _first_three(rgba) if rgb else image
+    if len(passes) > 1:
+        image = _first_three(target.read(passes[1], "f1"))
+    return View(image, camera, mask, depth, xyz)
 
 
 def _first_three(array: NDArray[Any]) -> NDArray[Any]:
