@@ -26,10 +26,10 @@ from posekit.camera import box_iou
 from posekit.datasets.bop import BopDataset, Instance
 from posekit.detect.novel import make_detector
 from posekit.detect.prompts import clip_box
-from posekit.estimate.estimator import PERTURBED, Estimators, PoseEstimator
+from posekit.estimate.estimator import Estimators, PoseEstimator
 from posekit.estimate.instances import promising
-from posekit.estimate.refine import RefineOptions, compare, predicted_angle, refine, update_pose
-from posekit.first_pose.hypotheses import EvidenceScorer, agreement_of, perturbed_poses
+from posekit.estimate.refine import compare, predicted_angle, update_pose
+from posekit.first_pose.hypotheses import EvidenceScorer, agreement_of
 from posekit.geometry import rotation_angle
 from posekit.metrics import pose_error
 from posekit.results import Detection, Estimate
@@ -54,14 +54,10 @@ def measures_of(estimator: PoseEstimator, view: View, found: Estimate) -> dict[s
     share = drawn.mask.reshape(drawn.mask.shape[0] // 4, 4, -1, 4).mean((1, 3))
     whole = prediction.silhouettes[1]
     box = estimator._box(view, pose)
-    around = perturbed_poses(pose, model, PERTURBED)
-    short = RefineOptions(options.update, "fixed", 3, colour_edge=options.colour_edge)
-    ends = refine(view, model, around, estimator.predictor, estimator.renderer, short)
-    turns = [np.rad2deg(rotation_angle(pose.R.T @ end.T_cam_obj.R)) for end in ends]
     scorer = EvidenceScorer(view, box, model, estimator.renderer)
-    parts = {f"evidence_{k}": v for k, v in zip(("own", "best"), _evidence(scorer, pose, ends), strict=True)}
     size = max(box[2] - box[0], box[3] - box[1])
-    return parts | {
+    return {
+        "evidence": scorer.scores([pose])[0],
         "structure": agreement.structure,
         "colour": agreement.colour,
         "blur": float(np.log(np.median(points.scale_px))) if len(points.scale_px) else 2.0,
@@ -71,15 +67,8 @@ def measures_of(estimator: PoseEstimator, view: View, found: Estimate) -> dict[s
         "visible": float(points.visible.mean()) if len(points.visible) else 0.0,
         "net_score": _odds(prediction.score or 0.0),
         "silhouette": float(np.minimum(share, whole).sum() / max(np.maximum(share, whole).sum(), 1e-6)),
-        "spread": float(np.log(np.median(turns) + 0.3)),
-        "spread_most": float(np.log(max(turns) + 0.3)),
         "size": float(np.log(size)),
     }
-
-
-def _evidence(scorer: EvidenceScorer, pose: Any, ends: Sequence[Any]) -> tuple[float, float]:
-    own, *others = scorer.scores([pose, *(end.T_cam_obj for end in ends)])
-    return own, own - max(others)
 
 
 def _turn(a: Any, b: Any) -> float:
