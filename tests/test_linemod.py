@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -145,6 +146,16 @@ def test_where_data_is_looked_for(bop: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert data_folder() == bop / "cache/posekit/data"
     with pytest.raises(InputError, match="Fetch it with: posekit download lm --root"):
         find_root(info, None)
+
+
+def test_a_known_name_with_another_split_is_read_from_that_split(bop: Path, tmp_path: Path) -> None:
+    root = tmp_path / bop.name
+    shutil.copytree(bop, root)
+    (root / "test").rename(root / "train")
+    data, info = open_dataset(None, root, "train")
+    assert info.name == "lm" and list(data.images())
+    with pytest.raises(InputError, match="no folder test/ in it"):
+        open_dataset("lm", root)
 
 
 def test_any_folder_in_bop_layout_will_do(bop: Path) -> None:

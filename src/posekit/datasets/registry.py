@@ -127,18 +127,20 @@ def data_folder() -> Path:
     return (Path(cache) if cache else Path.home() / ".cache") / "posekit" / "data"
 
 
-def find_root(info: DatasetInfo, root: Path | None) -> Path:
-    """The data set's folder: ``root`` itself or the one of its name in it, else in `data_folder`.
+def find_root(info: DatasetInfo, root: Path | None, split: str | None = None) -> Path:
+    """The data set's folder with a split (by default its usual one): ``root`` itself or the one of its name in it, else
+    in `data_folder`.
 
     Raises InputError where it is not there; the message has the command that fetches it.
     """
     base = data_folder() if root is None else root
     candidates = [base / info.below, base / info.name] if root is None else [base, base / info.below, base / info.name]
+    folder = (split or info.split).partition(":")[0]
     for candidate in candidates:
-        if (candidate / info.split).is_dir() or is_deepim(candidate):
+        if (candidate / folder).is_dir() or is_deepim(candidate):
             return candidate
     raise InputError(
-        f"the data set {info.name} ({info.title}) is not in {base}: there is no folder {info.split}/ in it or in "
+        f"the data set {info.name} ({info.title}) is not in {base}: there is no folder {folder}/ in it or in "
         f"{info.below}/. Fetch it with: posekit download {info.name} --root {base}; or give the folder that "
         "has it (--root DIR, root= in Python)."
     )
@@ -179,7 +181,7 @@ def open_dataset(
             return data, DatasetInfo(data.name, data.name, tuple(data.model_ids()), own_names(root))
         name = known.name
     info = dataset_info(name)
-    folder = find_root(info, root)
+    folder = find_root(info, root, split)
     if name == "linemod":
         if units != "auto":
             raise ConfigError(f"the units of {info.title}'s meshes are known: leave the units {units} out.")
