@@ -149,7 +149,7 @@ def test_where_data_is_looked_for(bop: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_a_known_name_with_another_split_is_read_from_that_split(bop: Path, tmp_path: Path) -> None:
-    root = tmp_path / bop.name
+    root = tmp_path / "elsewhere" / bop.name
     shutil.copytree(bop, root)
     (root / "test").rename(root / "train")
     data, info = open_dataset(None, root, "train")
