@@ -267,7 +267,7 @@ def _results(
             "split": data.split,
             "split_list": getattr(data, "split_label", None),
             "split_hash": getattr(data, "split_hash", None),
-            "instances": "the test's targets" if options.min_visible is None else f"visible >= {options.min_visible:g}",
+            "instances": _chosen(options.min_visible),
             "masks": notes.get("masks", {}),
         },
         "options": options.as_dict(),
@@ -282,6 +282,13 @@ def _results(
         if key in notes:
             results[key] = notes[key]
     return results | {"instances": table.instances(scored)}
+
+
+def _chosen(min_visible: float | None) -> str:
+    """Which instances were measured, in words."""
+    if min_visible is None:
+        return "the test's targets"
+    return f"at least {100 * min_visible:g} % visible" if min_visible > 0 else "all annotated"
 
 
 def _mean(times: Mapping[Any, float]) -> float | None:
