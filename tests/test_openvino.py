@@ -106,7 +106,7 @@ def test_an_estimate_needs_no_torch(kept: Path) -> None:
 
 
 def test_a_conversion_reports_nothing_to_others(tmp_path: Path) -> None:
-    """OpenVINO's telemetry leaves files in the home folder. It starts with the import, so in a new process, some 5 s."""
+    """OpenVINO's telemetry leaves files in the home folder. It starts with the import: in a new process, some 5 s."""
     code = (
         "import os; from posekit.nets.config import LiteConfig; from posekit.nets.openvino import OpenVinoPredictor\n"
         "from posekit.nets.weights import build\n"
