@@ -45,7 +45,7 @@ _STYLE = """
 --c0:#2563eb;--c1:#d97706;--c2:#059669;--c3:#9333ea;--c4:#dc2626}
 @media(prefers-color-scheme:dark){:root{--ink:#e6e9ec;--soft:#9aa4ae;--line:#343b43;--page:#15181c;--card:#1e2329;
 --c0:#6ea8fe;--c1:#f0a94b;--c2:#43c59e;--c3:#c084fc;--c4:#f87171}}
-*{box-sizing:border-box}body{margin:0 auto;max-width:1120px;padding:24px 20px 60px;background:var(--page);
+*{box-sizing:border-box}body{margin:0 auto;max-width:1260px;padding:24px 20px 60px;background:var(--page);
 color:var(--ink);font:15px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,sans-serif}
 h1{font-size:25px;margin:0 0 4px}h2{font-size:18px;margin:36px 0 10px}p{margin:4px 0}.soft{color:var(--soft)}
 .big{display:flex;flex-wrap:wrap;gap:12px;margin:18px 0}.big div{background:var(--card);border-radius:8px;
@@ -203,14 +203,19 @@ def _traces(scored: Scored) -> str:
         held = np.array([np.pad(t[k], (0, max(0, longest - len(t[k]))), mode="edge")[:longest] for t in traces])
         quartiles = np.percentile(held, [75, 50, 25], axis=0)
         top = charts.nice_top(max(float(quartiles.max()), 0.1))
-        axes = charts.Axes("step", label, float(max(1, longest - 1)), top)
+        axes = charts.Axes("step", label, _whole_fifths(longest - 1), top)
         curves = [(name, x, q) for name, q in zip(("3 of 4 below", "median", "1 of 4 below"), quartiles, strict=True)]
         parts.append(charts.lines(axes, curves, f"{label.split(',')[0]} by step"))
     steps = np.array([len(turn) - 1 for turn, _ in traces])
-    axes = charts.Axes("steps", "estimates, %", float(max(1, steps.max())))
-    parts.append(charts.histogram(axes, steps, min(25, max(2, int(steps.max()))), "steps taken"))
+    axes = charts.Axes("steps", "estimates, %", _whole_fifths(steps.max()))
+    parts.append(charts.histogram(axes, steps, min(25, int(axes.x_to)), "steps taken"))
     note = "From the first to the final pose, without symmetries; finished ones keep their last error."
     return f"<div class=charts>{''.join(parts)}</div><p class=soft>{note}</p>"
+
+
+def _whole_fifths(steps: int) -> float:
+    """The end of an axis of steps: its five marks are whole numbers."""
+    return 5.0 * max(1, -(-int(steps) // 5))
 
 
 # --- cases ----------------------------------------------------------------------------------------------------------
