@@ -482,6 +482,7 @@ def test_the_report_stands_alone(alone: Path) -> None:
     for title in ("Per object", "Recall against threshold", "Errors", "Refinement", "Best cases", "Worst cases"):
         assert f"<h2>{title}</h2>" in page
     assert page.count("data:image/jpeg;base64,") == 8
+    assert "What the columns mean" in page and "<td>object " in page, "a number is no name, and is said once"
 
 
 def test_true_masks_are_said_where_they_are_used(alone: Path, root: Path, tmp_path: Path) -> None:

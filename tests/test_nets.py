@@ -9,6 +9,8 @@ finite. There are no warnings: weights are read strictly.
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -342,6 +344,18 @@ def test_weights_come_back_as_they_went(tmp_path: Path, preset: str, config: Lit
     assert (loaded.mvnet is None) == (networks.mvnet is None)
     assert {p.name for p in tmp_path.iterdir()} == {"mine.safetensors", "mine.toml"}
     assert all(v.dtype != torch.float32 for v in load_file(tmp_path / "mine.safetensors").values())
+
+
+def test_loading_does_not_import_the_compiler(tmp_path: Path) -> None:
+    """In an interpreter of its own, some 2 s: torch's compiler takes another second to import."""
+    save_networks(tmp_path / "paper", build("paper", TINY_PAPER), {})
+    code = (
+        "import sys; from pathlib import Path; from posekit.nets.weights import load_networks;"
+        f"load_networks('lite'); load_networks('paper', Path({str(tmp_path / 'paper')!r}));"
+        "assert 'torch._dynamo' not in sys.modules, 'torch._dynamo was imported'"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 def test_bad_weights_are_refused(tmp_path: Path) -> None:

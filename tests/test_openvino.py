@@ -105,6 +105,22 @@ def test_an_estimate_needs_no_torch(kept: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
+def test_a_conversion_reports_nothing_to_others(tmp_path: Path) -> None:
+    """OpenVINO's telemetry leaves files in the home folder. It starts with the import: in a new process, some 5 s."""
+    code = (
+        "import os; from posekit.nets.config import LiteConfig; from posekit.nets.openvino import OpenVinoPredictor\n"
+        "from posekit.nets.weights import build\n"
+        "small = LiteConfig(size=(64, 48), widths=(16, 32), blocks=2, bottleneck=16, fine=16)\n"
+        "OpenVinoPredictor(lambda: build('lite', small).svnet.eval(), 'untrained', small.size, threads=1)\n"
+        "print(os.environ['CI'])"
+    )
+    env = {**os.environ, "HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache"), "CI": "false"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=env)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "false\n", "the environment is as before"
+    assert not [p.name for p in tmp_path.iterdir() if p.name != "cache"]
+
+
 def test_a_predictor_is_freed(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(kept))
     predictor = Runtime(runtime="openvino").predictor

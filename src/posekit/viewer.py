@@ -717,13 +717,13 @@ class PoseViewer:
         c.undo = gui.add_button("Undo", disabled=True)
         c.save = gui.add_button("Save pose")
         c.message = gui.add_markdown("")
-        with gui.add_folder("Look"):
+        with gui.add_folder("Display"):
             c.opacity = gui.add_slider(
                 "Opacity", min=0.0, max=1.0, step=0.2, initial_value=_level(self.options.opacity)
             )
-            c.gizmo = gui.add_checkbox("Gizmo", True)
+            c.gizmo = gui.add_checkbox("Handles", True)
             c.zoom = gui.add_slider("Zoom", min=1.0, max=MOST_ZOOM, step=0.1, initial_value=1.0)
-            c.reset = gui.add_button("Through the camera")
+            c.reset = gui.add_button("Reset view")
         self._on(c.opacity, self._set_opacity)
         self._on(c.gizmo, lambda value: setattr(self.gizmo, "visible", bool(value)))
         self._on(c.zoom, lambda _: self.look_through())

@@ -95,8 +95,11 @@ def _torch() -> list[Finding]:
 
 
 def _openvino() -> list[Finding]:
+    from posekit.nets.telemetry import without_telemetry
+
     try:
-        import openvino
+        with without_telemetry():
+            import openvino
     except (ImportError, OSError) as error:
         return [Finding("OpenVINO", f"cannot be imported: {error}", "problem", _reinstall("openvino"))]
     return [Finding("OpenVINO", str(openvino.__version__).partition("-")[0])]

@@ -24,17 +24,28 @@ from posekit.zoom import zoom_to_pose
 SHOWN = 20  # cases, the best and the worst
 _TILE = (240, 180)
 TITLES = {
-    "2deg_2cm": "(2°, 2 cm)", "5deg_5cm": "(5°, 5 cm)", "10deg_10cm": "(10°, 10 cm)", "2deg_2cm_sym": "(2, 2) sym",
-    "5deg_5cm_sym": "(5, 5) sym", "10deg_10cm_sym": "(10, 10) sym", "add_01d": "ADD(-S) 0.1d", "add_auc": "ADD(-S) AUC",
-    "adds_auc": "ADD-S AUC", "proj_5px": "Proj 5 px", "vsd_ar": "AR VSD", "mssd_ar": "AR MSSD", "mspd_ar": "AR MSPD",
-    "ar": "AR", "ar_mssd_mspd": "AR MSSD, MSPD", "mssd_ap": "AP MSSD", "mspd_ap": "AP MSPD", "ap": "AP",
+    "2deg_2cm": "(2°, 2\u00a0cm)", "5deg_5cm": "(5°, 5\u00a0cm)", "10deg_10cm": "(10°, 10\u00a0cm)",
+    "2deg_2cm_sym": "(2,\u00a02) sym", "5deg_5cm_sym": "(5,\u00a05) sym", "10deg_10cm_sym": "(10,\u00a010) sym",
+    "add_01d": "ADD(-S) 0.1d", "add_auc": "ADD(-S) AUC", "adds_auc": "ADD-S AUC", "proj_5px": "Proj 5\u00a0px",
+    "vsd_ar": "AR VSD", "mssd_ar": "AR MSSD", "mspd_ar": "AR MSPD", "ar": "AR", "ar_mssd_mspd": "AR MSSD, MSPD",
+    "mssd_ap": "AP MSSD", "mspd_ap": "AP MSPD", "ap": "AP",
 }  # fmt: skip
+_MEANINGS = (
+    ("(5°, 5\u00a0cm)", "poses with a rotation error below 5 degrees and a translation error below 5 cm"),
+    ("sym", "the same, relative to the nearest of the poses that the object's symmetries make equal"),
+    ("ADD(-S) 0.1d", "mean distance of the mesh's vertices below a tenth of the object's diameter; "
+     "with symmetries, each to its nearest vertex. AUC: the area under the recall curve up to 10 cm"),
+    ("Proj 5\u00a0px", "mean distance of the projected vertices below 5 pixels"),
+    ("MSSD, MSPD, VSD", "the errors of the BOP benchmark: largest distance of a vertex in space, in the picture, "
+     "and difference of the visible depth. AR: recall, mean over thresholds. AP: average precision"),
+    ("training", "seen: the mesh was in the training of the weights; novel: it was not"),
+)  # fmt: skip
 _STYLE = """
 :root{color-scheme:light dark;--ink:#1b1f24;--soft:#5b6570;--line:#d9dee3;--page:#fff;--card:#f6f7f9;
 --c0:#2563eb;--c1:#d97706;--c2:#059669;--c3:#9333ea;--c4:#dc2626}
 @media(prefers-color-scheme:dark){:root{--ink:#e6e9ec;--soft:#9aa4ae;--line:#343b43;--page:#15181c;--card:#1e2329;
 --c0:#6ea8fe;--c1:#f0a94b;--c2:#43c59e;--c3:#c084fc;--c4:#f87171}}
-*{box-sizing:border-box}body{margin:0 auto;max-width:1120px;padding:24px 20px 60px;background:var(--page);
+*{box-sizing:border-box}body{margin:0 auto;max-width:1260px;padding:24px 20px 60px;background:var(--page);
 color:var(--ink);font:15px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,sans-serif}
 h1{font-size:25px;margin:0 0 4px}h2{font-size:18px;margin:36px 0 10px}p{margin:4px 0}.soft{color:var(--soft)}
 .big{display:flex;flex-wrap:wrap;gap:12px;margin:18px 0}.big div{background:var(--card);border-radius:8px;
@@ -45,7 +56,7 @@ th{font-weight:600;white-space:normal;vertical-align:bottom;
 color:var(--soft)}th:first-child,td:first-child{text-align:left}tr.sum td{font-weight:600}
 .charts{display:grid;grid-template-columns:repeat(auto-fill,minmax(320px,1fr));gap:14px}
 figure{margin:0;background:var(--card);border-radius:8px;padding:10px}figcaption{font-size:13px;font-weight:600}
-svg{width:100%;height:auto;display:block}svg.wide{max-width:760px}svg.spark{width:110px;height:24px;display:inline-block}
+svg{width:100%;height:auto;display:block}svg.wide{max-width:760px}svg.spark{width:110px;height:24px;display:inline-block;vertical-align:middle}
 svg text{font:11px system-ui,sans-serif;fill:var(--soft)}.left,.name{text-anchor:end}.middle{text-anchor:middle}
 .grid{stroke:var(--line);stroke-width:1}.line{fill:none;stroke-width:2}.bar{fill:var(--c0)}
 .line.c0{stroke:var(--c0)}.line.c1{stroke:var(--c1)}.line.c2{stroke:var(--c2)}.line.c3{stroke:var(--c3)}
@@ -53,6 +64,8 @@ svg text{font:11px system-ui,sans-serif;fill:var(--soft)}.left,.name{text-anchor
 .cases{display:grid;grid-template-columns:repeat(auto-fill,minmax(340px,1fr));gap:12px}
 .cases div{background:var(--card);border-radius:8px;overflow:hidden;font-size:12.5px}
 .cases img{width:100%;display:block}.cases p{padding:0 9px}.cases p:last-child{padding-bottom:7px}
+details{margin:8px 0;font-size:13px;color:var(--soft)}summary{cursor:pointer}dl{margin:6px 0}dt{font-weight:600}
+dd{margin:0 0 4px 14px}
 code{font-size:13px;overflow-wrap:anywhere}
 """
 
@@ -122,7 +135,7 @@ def _object_table(results: Mapping[str, Any]) -> str:
     for obj_id, entry in results["per_object"].items():
         cells = "".join(f"<td>{_percent(entry.get(m))}</td>" for m in columns)
         rows.append(
-            f"<tr><td>{escape(obj_id)} {escape(entry['name'])}</td><td>{escape(entry.get('novelty', ''))}</td>"
+            f"<tr><td>{escape(_name(obj_id, entry))}</td><td>{escape(entry.get('novelty', ''))}</td>"
             f"<td>{entry['instances']}</td><td>{entry['missing']}</td>{cells}</tr>"
         )
     counts = results["counts"]
@@ -130,10 +143,16 @@ def _object_table(results: Mapping[str, Any]) -> str:
         cells = "".join(f"<td>{_percent(values.get(m))}</td>" for m in columns)
         numbers = f"<td></td><td>{counts['instances']}</td><td>{counts['missing']}</td>"
         rows.append(f"<tr class=sum><td>{name}</td>{numbers}{cells}</tr>")
+    meanings = "".join(f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in _MEANINGS)
     return (
         f"<div class=scroll><table><tr><th>object</th><th>training</th><th>instances</th><th>missing</th>{head}</tr>"
-        f"{''.join(rows)}</table></div>"
+        f"{''.join(rows)}</table></div><details><summary>What the columns mean</summary><dl>{meanings}</dl></details>"
     )
+
+
+def _name(obj_id: str, entry: Mapping[str, Any]) -> str:
+    """The object's number and its name, where it has one."""
+    return entry["name"] if entry["name"] == f"object {obj_id}" else f"{obj_id} {entry['name']}"
 
 
 def _percent(value: float | None) -> str:
@@ -171,7 +190,7 @@ def _histograms(scored: Scored) -> str:
 def _bars(results: Mapping[str, Any]) -> str:
     shown = [m for m in ("2deg_2cm", "5deg_5cm", "10deg_10cm", "add_01d", "mssd_ar") if m in results["mean"]]
     entries = list(results["per_object"].items())
-    names = [f"{o} {e['name']}" if e["name"] != f"object {o}" else e["name"] for o, e in entries]
+    names = [_name(o, e) for o, e in entries]
     groups = [(TITLES[m], [e[m] for _, e in entries]) for m in shown]
     return charts.bars(names, groups, "per object, percent")
 
@@ -200,14 +219,19 @@ def _traces(scored: Scored) -> str:
         held = np.array([np.pad(t[k], (0, max(0, longest - len(t[k]))), mode="edge")[:longest] for t in traces])
         quartiles = np.percentile(held, [75, 50, 25], axis=0)
         top = charts.nice_top(max(float(quartiles.max()), 0.1))
-        axes = charts.Axes("step", label, float(max(1, longest - 1)), top)
+        axes = charts.Axes("step", label, _whole_fifths(longest - 1), top)
         curves = [(name, x, q) for name, q in zip(("3 of 4 below", "median", "1 of 4 below"), quartiles, strict=True)]
         parts.append(charts.lines(axes, curves, f"{label.split(',')[0]} by step"))
     steps = np.array([len(turn) - 1 for turn, _ in traces])
-    axes = charts.Axes("steps", "estimates, %", float(max(1, steps.max())))
-    parts.append(charts.histogram(axes, steps, min(25, max(2, int(steps.max()))), "steps taken"))
+    axes = charts.Axes("steps", "estimates, %", _whole_fifths(steps.max()))
+    parts.append(charts.histogram(axes, steps, min(25, int(axes.x_to)), "steps taken"))
     note = "From the first to the final pose, without symmetries; finished ones keep their last error."
     return f"<div class=charts>{''.join(parts)}</div><p class=soft>{note}</p>"
+
+
+def _whole_fifths(steps: int) -> float:
+    """The end of an axis of steps: its five marks are whole numbers."""
+    return 5.0 * max(1, -(-int(steps) // 5))
 
 
 # --- cases ----------------------------------------------------------------------------------------------------------
@@ -219,7 +243,10 @@ def _cases(scored: Scored, data: Dataset) -> str:
     count = min(SHOWN, len(order) // 2)  # nothing is shown twice
     best = [_case(scored, int(k), data, renderer) for k in order[: len(order) - count][:SHOWN]]
     worst = [_case(scored, int(k), data, renderer) for k in order[::-1][:count]]
-    note = "<p class=soft>Left, orange: the truth. Right, green: the estimate. The line: rotation error by step.</p>"
+    note = (
+        "<p class=soft>Left, orange: the true pose. Right, green: the estimate. After the object: scene/picture. "
+        "d: the object's diameter. The line: rotation error by step.</p>"
+    )
     return _section("Best cases", f"{note}<div class=cases>{''.join(best)}</div>") + _section(
         "Worst cases", f"<div class=cases>{''.join(worst)}</div>"
     )

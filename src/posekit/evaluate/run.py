@@ -270,7 +270,7 @@ def _results(
             "split": data.split,
             "split_list": getattr(data, "split_label", None),
             "split_hash": getattr(data, "split_hash", None),
-            "instances": _asked(options),
+            "instances": _chosen(options),
             "masks": notes.get("masks", {}),
         },
         "options": options.as_dict(),
@@ -287,10 +287,11 @@ def _results(
     return results | {"instances": table.instances(scored)}
 
 
-def _asked(options: EvalOptions) -> str:
-    if options.min_visible is not None:
-        return f"visible >= {options.min_visible:g}"
-    return "all frames after the first" if options.protocol == RBOT else "the test's targets"
+def _chosen(options: EvalOptions) -> str:
+    """Which instances were measured, in words."""
+    if options.min_visible is None:
+        return "all frames after the first" if options.protocol == RBOT else "the test's targets"
+    return f"at least {100 * options.min_visible:g} % visible" if options.min_visible > 0 else "all annotated"
 
 
 def _mean(times: Mapping[Any, float]) -> float | None:

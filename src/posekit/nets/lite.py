@@ -197,7 +197,7 @@ class LiteSVNet(nn.Module):
         channels = config.widths[1]
         self.tower = Tower(3, config.widths)
         self.pair = Tower(PAIR, config.widths)
-        self.place = nn.Parameter(0.02 * torch.randn(2, channels, h, w))  # of the cells, observed and rendered
+        self.place = nn.Parameter(nn.init.normal_(torch.empty(2, channels, h, w), std=0.02))  # observed, rendered
         self.exchange = nn.ModuleList(
             [Exchange(channels, config.heads, config.bottleneck) for _ in range(config.blocks)]
         )

@@ -192,8 +192,8 @@ class MatchingMVNet(nn.Module):
         fine, coarse = config.widths
         self.settle, self.enter = nn.GroupNorm(8, coarse), nn.Conv2d(coarse, channels, 1)
         self.cover = nn.Conv2d(4, channels, 1)
-        self.crop_place = nn.Parameter(0.02 * torch.randn(1, channels, self.rows, self.columns))
-        self.view_place = nn.Parameter(0.02 * torch.randn(1, channels, GRID, GRID))
+        self.crop_place = nn.Parameter(nn.init.normal_(torch.empty(1, channels, self.rows, self.columns), std=0.02))
+        self.view_place = nn.Parameter(nn.init.normal_(torch.empty(1, channels, GRID, GRID), std=0.02))
         self.crop_code, self.view_code = Code(channels, (self.rows, self.columns)), Code(channels, (GRID, GRID))
         self.part = nn.Linear(channels, part)
         self.sharpness = nn.Parameter(torch.tensor([8.0, 8.0, 8.0]))

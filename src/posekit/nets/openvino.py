@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import openvino
 
 from posekit._version import __version__
 from posekit.io.cache_folder import make_room
@@ -22,7 +21,11 @@ from posekit.io.files import user_cache
 from posekit.nets.inputs import relief, to_input
 from posekit.nets.precision import usable_cores
 from posekit.nets.predictor import PairPrediction, unpack
+from posekit.nets.telemetry import without_telemetry
 from posekit.view import View
+
+with without_telemetry():
+    import openvino
 
 if TYPE_CHECKING:
     from posekit.nets.lite import LiteSVNet
@@ -123,7 +126,8 @@ def _convert(svnet: LiteSVNet) -> Any:
     with torch.inference_mode(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of sizes that become constants: a crop's size is one
         traced = torch.jit.trace(Answers().eval(), example, check_trace=False)
-    return openvino.convert_model(traced, example_input=example, input=[list(x.shape) for x in example])
+    with without_telemetry():
+        return openvino.convert_model(traced, example_input=example, input=[list(x.shape) for x in example])
 
 
 def _keep(model: Any, folder: Path) -> None:

@@ -12,6 +12,7 @@ from posekit.errors import ConfigError
 from posekit.nets.config import LiteConfig, WeightsFile
 from posekit.nets.precision import choose_device, threads, usable_cores
 from posekit.nets.predictor import Predictor
+from posekit.nets.telemetry import without_telemetry
 
 if TYPE_CHECKING:
     from posekit.nets.weights import Networks
@@ -101,7 +102,8 @@ class Runtime:
 
 def _has_openvino() -> bool:
     try:
-        import openvino  # noqa: F401
+        with without_telemetry():
+            import openvino  # noqa: F401
     except (ImportError, OSError) as error:
         log.warning("OpenVINO cannot be used (%s): PyTorch runs the networks, at half the speed.", error)
         return False

@@ -14,6 +14,7 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 from posekit.errors import ConfigError, WeightsError
 from posekit.io.files import write_bytes_atomic, write_text_atomic
@@ -113,13 +114,25 @@ def load_networks(preset: str, path: Path | None = None) -> Networks:
     return dataclasses.replace(networks, mvnet=mvnet, digest=about.digest, about=about.about)
 
 
+class _WithoutNormals(TorchFunctionMode):
+    """Leaves out normally distributed first values: for meta tensors torch imports its compiler to make them."""
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Mapping[str, Any] | None = None
+    ) -> Any:
+        named = kwargs or {}
+        if getattr(func, "__name__", "").endswith("normal_"):  # normal_, kaiming_normal_: of the tensor or of nn.init
+            return args[0] if args else named["tensor"]
+        return func(*args, **named)
+
+
 def _built(preset: str, config: LiteConfig | PaperConfig, state: Mapping[str, Tensor], file: Path) -> Networks:
     """The networks of a configuration, without memory for their parameters, which the file's take the place of.
 
     Raises WeightsError where a configuration makes none, or networks with other parameters than the file holds.
     """
     try:
-        with torch.device("meta"):
+        with torch.device("meta"), _WithoutNormals():
             networks = build(preset, config)
         parameters = sum(v.numel() for v in networks.svnet.state_dict().values())
         stored = sum(v.numel() for k, v in state.items() if k.startswith("svnet."))
