@@ -127,7 +127,7 @@ def unhidden(view: View, drawn: View) -> Mask:
     there = parts[inner[:, 1], inner[:, 0]]
     for part in range(1, count):
         steps = step[(there == part) & shown]
-        if not len(steps) or steps.mean() > ENDS:
+        if not len(steps) or np.median(steps) > ENDS:
             visible[parts == part] = True
     return visible
 
