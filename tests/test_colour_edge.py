@@ -127,6 +127,29 @@ def test_chromaticities_are_shares_of_brightness() -> None:
     assert edge.like_mesh(near, view).all()
 
 
+def test_a_mesh_of_another_colour_does_not_hide_the_object() -> None:
+    radius = 30
+    mesh = replace(drawn(radius), image=one_colour(GREEN))
+    assert not edge.like_mesh(View(painted(radius), CAMERA), mesh).any()
+    assert edge.unhidden(View(painted(radius), CAMERA), mesh)[disc(radius)].all()
+    half = painted(radius).copy()  # one half has the mesh's colour
+    half[:, :80][disc(radius)[:, :80]] = GREEN
+    assert edge.unhidden(View(half, CAMERA), mesh)[disc(radius)].all()
+
+
+def test_what_goes_on_beyond_the_outline_hides_the_object() -> None:
+    radius = 30
+    mesh = replace(drawn(radius), image=one_colour(RED))
+    image = painted(radius).copy()
+    bar = np.zeros((HEIGHT, WIDTH), bool)
+    bar[:, 60:75] = True
+    image[bar] = GREEN
+    visible = edge.unhidden(View(image, CAMERA), mesh)
+    covered = disc(radius) & bar
+    assert (covered & visible).sum() < 0.2 * covered.sum()
+    assert (disc(radius) & ~bar & ~visible).sum() < 0.1 * disc(radius).sum(), "the bar's edge is smoothed"
+
+
 def test_chromaticities_are_smoothed_along_both_axes() -> None:
     speck = np.full((31, 31, 3), 60, np.uint8)
     speck[15, 15] = 255, 60, 60

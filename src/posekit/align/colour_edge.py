@@ -32,6 +32,7 @@ MIXED, BOTH, EDGE = 2, 2, 30.0  # pixels to either side that mix colours, that s
 BAND = 3  # pixels on either side of an edge in which `contrast` looks
 GAP, RING = 1, 14  # pixels beside the outline that no colours are learned from, and how far the surroundings reach
 BLUR = 1.0  # pixels over which neighbouring probabilities are averaged
+ASIDE, ENDS = 3.0, 0.25  # pixels beside an outline; by how much the object's chance falls across it where it ends
 HUE = 0.12  # distance of chromaticities beyond which a pixel is not the mesh's
 SUDDEN, SMOOTH = 0.12, 1.0  # the same beyond what it has been before; pixels over which that is averaged
 # pixels: how deep a hidden part is that no pose's error explains, and how near to it outlines are not used
@@ -104,6 +105,31 @@ def learn(view: View, silhouette: Mask, seen: Mask) -> Colours:
 def like_mesh(view: View, drawn: View) -> Mask:
     """Where (H, W) a frame's crop has the hue of the mesh drawn there: a first guess of what is not hidden."""
     return np.asarray(np.linalg.norm(off_colour(view, drawn), axis=2) < HUE)
+
+
+def unhidden(view: View, drawn: View) -> Mask:
+    """A first guess of where (H, W) a frame's crop shows the object rather than something before it.
+
+    Parts with another hue than the mesh may be hidden, or the mesh's colours may be wrong. What hides the object goes
+    on beyond its outline, so the colours on both sides of the outline are alike there; the object itself ends there.
+    """
+    assert drawn.mask is not None
+    solid = drawn.mask
+    unlike = (solid & ~like_mesh(view, drawn)).astype(np.uint8)
+    visible = ~cv2.morphologyEx(unlike, cv2.MORPH_OPEN, _disc(1)).astype(bool)
+    pixels, normals = find_outline(solid)
+    if not len(pixels):
+        return visible
+    chance = cv2.GaussianBlur(learn(view, solid, np.ones_like(solid)).posterior(view.image), (0, 0), BLUR)
+    (inner, _), (outer, shown) = (_pixels(pixels + side * ASIDE * normals, view) for side in (-1, 1))
+    step = chance[inner[:, 1], inner[:, 0]] - chance[outer[:, 1], outer[:, 0]]
+    count, parts = cv2.connectedComponents((~visible).astype(np.uint8))
+    there = parts[inner[:, 1], inner[:, 0]]
+    for part in range(1, count):
+        steps = step[(there == part) & shown]
+        if not len(steps) or np.median(steps) > ENDS:
+            visible[parts == part] = True
+    return visible
 
 
 def off_colour(view: View, drawn: View) -> FArray:

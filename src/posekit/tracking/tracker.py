@@ -18,7 +18,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from posekit.align.colour_edge import Colours, Tint, contrast, learn, like_mesh, off_colour, outline_lines
+from posekit.align.colour_edge import Colours, Tint, contrast, learn, off_colour, outline_lines, unhidden
 from posekit.align.gauss_newton import GaussianPose, Lines, Points, Residual, fuse
 from posekit.camera import Camera
 from posekit.errors import CameraError, ConfigError
@@ -274,7 +274,7 @@ class Tracker:
         centred = pose @ self.model.T_obj_ctr
         _, shift, depth = GIVEN
         self._state = GaussianPose.about(centred, seen.camera, turn_std, shift, depth)
-        visible = like_mesh(seen, drawn)
+        visible = unhidden(seen, drawn)
         if (visible & drawn.mask).sum() < 0.15 * drawn.mask.sum():
             visible = np.ones_like(visible)
         self._colours = learn(seen, drawn.mask, visible)
