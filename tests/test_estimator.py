@@ -22,7 +22,7 @@ from posekit.nets.paper import PaperSVNet
 from posekit.nets.weights import Networks, build, save_networks
 from posekit.render import Renderer
 from posekit.results import Branch, Detection, Estimate, Source
-from posekit.tracking.tracker import LOST, RESTARTED, Tracker
+from posekit.tracking.tracker import LOST, TRACKED, TrackConfig, Tracker
 from posekit.view import View
 from test_refine import Oracle
 
@@ -149,7 +149,7 @@ def test_a_tracked_pose_stays_on_its_branch() -> None:
             return [Detection((10.0, 10.0, 50.0, 50.0), None, 1.0, model.name, Source.TRAINED)]
 
     tracker = Tracker(model, CAMERA, pose=TRUTH, estimator=Finding(), detector=Finding(),  # type: ignore[arg-type]
-                      predictor=Oracle(model, TRUTH))  # fmt: skip
+                      predictor=Oracle(model, TRUTH), config=TrackConfig(search=1))  # fmt: skip
     shown, empty = (
         photograph(model, TRUTH).image,
         np.random.default_rng(2).integers(0, 60, (480, 640, 3)).astype(np.uint8),
@@ -164,7 +164,7 @@ def test_a_tracked_pose_stays_on_its_branch() -> None:
     assert tracker.step(empty).state == LOST
     tracker.detector = Finding()  # type: ignore[assignment]
     found = tracker.step(shown)
-    assert found.state == RESTARTED and found.T_cam_obj is not None and found.estimate is not None
+    assert found.state == TRACKED and found.T_cam_obj is not None and found.estimate is not None
     assert found.estimate.branch is Branch.LAST and pose_error(found.T_cam_obj, TRUTH)[0] < 0.02
 
 

@@ -21,6 +21,11 @@ from posekit.results import Detection, Estimate, Source
 from posekit.view import View
 
 
+# of the novel detector's similarity beside a refined pose's score, in log odds, and the one that says nothing; among
+# proposals that poses chose it tells little: docs/log.md, 2026-11-30
+POSED_WEIGHT, POSED_USUAL = 3.0, 0.5
+
+
 class Estimator(Protocol):
     """What a `PoseEstimator` does for the search."""
 
@@ -120,13 +125,13 @@ def estimates_of(
 ) -> list[Estimate]:
     """An estimate for each detection that leads to one, in their order, until as many sure instances are found as are
     wanted; detections by hand are all estimated. What the novel detector found is scored by
-    how much it looks like the mesh as well: a logistic function's argument grows by `WEIGHT` times what the similarity
-    is above `USUAL` (docs/decisions/0015)."""
+    how much it looks like the mesh as well: the log odds grow by `POSED_WEIGHT` times what the similarity is above
+    `POSED_USUAL`."""
     found: list[Estimate] = []
     for detection in detections:
         if not detection.source.by_hand and _enough(found, options):
             break
-        shift = WEIGHT * (detection.score - USUAL) if detection.source is Source.NOVEL else 0.0
+        shift = POSED_WEIGHT * (detection.score - POSED_USUAL) if detection.source is Source.NOVEL else 0.0
         for estimate in estimator.estimate(view, [detection], shifted(options.min_score, -shift)):
             others = tuple(replace(e, score=shifted(e.score, shift)) for e in estimate.alternatives)
             found.append(replace(estimate, score=shifted(estimate.score, shift), alternatives=others))

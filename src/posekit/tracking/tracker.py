@@ -52,6 +52,8 @@ MOST_GROWN = 1.5  # pixels that an outline may look larger or smaller
 BIASED, MOST_BIASED, BIAS_RATE = 1.0, 2.0, 0.2
 ANGLE_OF_DOUBLE = math.radians(4.0)  # predicted angle at which that number doubles
 TINT_RATE = 0.15  # weight of a frame in the running tint
+# contrast of a silhouette, to the usual one, below which turned poses are tried too; by how much they are turned
+LESS_SEPARATED, TURNED = 0.88, math.radians(25.0)
 COARSE = 1500  # of the mesh that is drawn where the outline is looked for in smaller crops
 FACES = 6000  # of the mesh that is drawn: a crop shows no more
 LEAST_SCALE, KNEE = 0.5, 2.5  # pixels, no correspondence is more exact; standard deviations
@@ -71,8 +73,8 @@ SURE = 0.6  # share of a silhouette with the object's colours from which on a fr
 BORNE_OUT, NEAR_PX, LESS_CONTRAST, WIDE_DEG, WIDE_PX, TWICE = 0.5, 1.5, 0.7, 10.0, 1.5, 2.0
 CONTRADICTED, USUAL_RATE = 2, 0.1
 # what `Tracker._recalled` changes
-FOLLOWED = ("_state", "_before", "_colours", "_tint", "_motion", "_doubts", "_separated", "_separated_first", "_bias",
-            "_waiting", "_contradictions", "_contradicted")  # fmt: skip
+FOLLOWED = ("_state", "_before", "_colours", "_tint", "_motion", "_doubts", "_separated", "_separated_first",
+            "_separated_usual", "_bias", "_waiting", "_contradictions", "_contradicted")  # fmt: skip
 
 _ONE_SEARCH = Lock()  # detectors and estimators are shared by trackers, and searches take a core each
 
@@ -216,7 +218,8 @@ class Tracker:
         self._doubts = 0
         self._contradictions = self._contradicted = 0  # of the last frame; frames in a row that are contradicted
         self._usual = (0.0, 0.0)  # radians and pixels: the network's angle and its correspondences' distance
-        self._separated = self._separated_first = 0.0  # contrast of the last silhouette and of the first
+        # contrast of the last silhouette, of the first, and of those that the picture bears out, a running mean
+        self._separated = self._separated_first = self._separated_usual = 0.0
         self._grown = dict.fromkeys({1, *config.scales}, 0.0)  # pixels, see `_growth`
         self._bias = 0.0  # pixels of the crop: how far the network alone has been from what all evidence gave
         self._waiting = 0  # frames until the next search
@@ -281,6 +284,7 @@ class Tracker:
         self._tint = Tint.of(off_colour(seen, drawn), visible & drawn.mask)
         self._before = Keyframe(seen, drawn, Pose.rotation(seen.R_view_cam) @ centred, visible)
         self._separated = self._separated_first = contrast(seen, drawn.mask, self._colours)
+        self._separated_usual = self._separated
         self._grown = {scale: self._growth(view, pose, scale) for scale in {1, *self.config.scales}}
         return True
 
@@ -377,6 +381,7 @@ class Tracker:
         )
         count = sum(kinds)
         if count < CONTRADICTED:
+            self._separated_usual += USUAL_RATE * (self._separated - self._separated_usual)
             self._usual = (
                 usual_angle + USUAL_RATE * (prediction.angle - usual_angle),
                 usual_distance + USUAL_RATE * (distance - usual_distance),
@@ -423,9 +428,16 @@ class Tracker:
             starts.append(Pose(self._motion.R @ last.pose.R, last.pose.t + self._motion.t))
         *coarse, fine = self.config.scales
         aligned = [self._aligned(view, replace(predicted, pose=start), colours, coarse) for start in starts]
-        qualities = [self._separation(view, each.pose, colours) for each in (predicted, *aligned)]
-        best = int(np.argmax(np.array(qualities) - [0.0, *[self.config.margin] * len(aligned)]))
-        return self._aligned(view, (predicted, *aligned)[best], colours, [fine])
+        candidates = [predicted, *aligned]
+        qualities = [self._separation(view, each.pose, colours) for each in candidates]
+        if max(qualities) < LESS_SEPARATED * self._separated_usual:
+            best = candidates[int(np.argmax(qualities))].pose
+            for axis in np.concatenate([np.eye(3), -np.eye(3)]):
+                start = replace(predicted, pose=Pose(so3_exp(TURNED * axis) @ best.R, best.t))
+                candidates.append(self._aligned(view, start, colours, coarse))
+                qualities.append(self._separation(view, candidates[-1].pose, colours))
+        best_of = int(np.argmax(np.array(qualities) - [0.0, *[self.config.margin] * (len(candidates) - 1)]))
+        return self._aligned(view, candidates[best_of], colours, [fine])
 
     def _separation(self, view: View, T_cam_ctr: Pose, colours: Colours) -> float:
         """How well the silhouette of a pose separates the colours, see `contrast`."""
