@@ -34,7 +34,7 @@ STILL = float(np.deg2rad(0.25))  # of turns, and as a share of the distance: a p
 NEAR = float(np.deg2rad(12.0))  # corrections below which the outline is looked for: further off it is out of reach
 LEAST_SCALE, KNEE = 0.5, 2.5  # pixels, no correspondence is more exact; standard deviations
 # number of correspondences whose errors are correlated: they count as one against the outline's lines
-CORRELATED = 25.0
+CORRELATED = 12.0
 
 
 @dataclass(frozen=True)
