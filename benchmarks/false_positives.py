@@ -33,7 +33,7 @@ def main() -> None:
     args = parser.parse_args()
     data = BopDataset(args.root, split=args.split) if args.split else BopDataset(args.root)
     models = [ObjectModel.load(path, units=args.units) for path in args.meshes]
-    detector, _ = make_detector(args.detector, models)
+    detector, _ = make_detector(args.detector, models, doubtful=True)
     estimators = Estimators()
     pictures = data.images()
     chosen = np.linspace(0, len(pictures) - 1, min(args.images, len(pictures))).astype(int)
