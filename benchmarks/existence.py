@@ -84,10 +84,10 @@ def correct(found: Estimate, instances: Sequence[Instance], model: Any) -> tuple
     """Whether it is right, and its smallest error, degrees and diameters, among the picture's instances of the mesh."""
     errors = [(180.0, 9.0)]
     for each in instances:
-        turn, shift = pose_error(found.T_cam_obj, each.T_cam_obj, model.symmetries.transforms())
-        errors.append((float(np.rad2deg(turn)), float(shift) / model.diameter))
-    turn, shift = min(errors, key=lambda e: e[0] / RIGHT_DEG + e[1] / RIGHT_DIAMETERS)
-    return turn < RIGHT_DEG and shift < RIGHT_DIAMETERS, turn, shift
+        angle, shift = pose_error(found.T_cam_obj, each.T_cam_obj, model.symmetries.transforms())
+        errors.append((float(np.rad2deg(float(angle))), float(shift) / model.diameter))
+    turn, far = min(errors, key=lambda e: e[0] / RIGHT_DEG + e[1] / RIGHT_DIAMETERS)
+    return turn < RIGHT_DEG and far < RIGHT_DIAMETERS, turn, far
 
 
 def collect(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
@@ -99,7 +99,8 @@ def collect(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     detector, _ = make_detector("novel", list(given.values()), doubtful=True) if args.proposals else (None, None)
     chosen = np.linspace(0, len(pictures) - 1, min(args.images, len(pictures))).astype(int)
     for k in np.unique(chosen):
-        view, instances = data.view(*pictures[k]), data.instances(*pictures[k], every=True)
+        scene, image = pictures[k]
+        view, instances = data.view(scene, image), data.instances(scene, image, every=True)
         shown = [i for i in instances if i.visib_fract >= args.visible and i.box_visib is not None]
         for obj_id, detection in _asked(args, view, shown, given, detector, estimators, rng):
             model = given[obj_id]

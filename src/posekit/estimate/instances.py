@@ -20,7 +20,6 @@ from posekit.mesh.model import ObjectModel
 from posekit.results import Detection, Estimate, Source
 from posekit.view import View
 
-
 # of the novel detector's similarity beside a refined pose's score, in log odds, and the one that says nothing; among
 # proposals that poses chose it tells little: docs/log.md, 2026-11-30
 POSED_WEIGHT, POSED_USUAL = 3.0, 0.5
