@@ -112,7 +112,6 @@ def test_the_command_and_the_evaluation_find_the_same_poses(
 ) -> None:
     for place in ("posekit.detect.novel.make_detector", "posekit.evaluate.stages.make_detector"):
         monkeypatch.setattr(place, lambda *_, **__: (Oracles(root), ()))
-    monkeypatch.setattr("posekit.estimate.instances.POSED_WEIGHT", 20.0)  # so that untrained networks' poses are kept
     found = measured(root, weights, str(file) if kind == "file" else kind)
     for truth in truths(root):
         obj_id, box = truth.instance.obj_id, truth.box_visib
@@ -162,7 +161,7 @@ MODEL = bracket()
 
 
 def kept(fixed: Fixed, source: Source, options: SearchOptions | None = None) -> list[float]:
-    detections = [Detection(box, None, 0.5, MODEL.name, source) for box in BOXES]
+    detections = [Detection(box, None, 0.56, MODEL.name, source) for box in BOXES]
     [found] = find_instances(lambda _: fixed, VIEW, [MODEL], detections, options)
     return [e.score for e in found.instances]
 
@@ -190,7 +189,7 @@ def test_what_is_kept_depends_on_who_says_where_the_object_is() -> None:
 def test_the_search_ends_with_as_many_sure_instances_as_are_wanted() -> None:
     def asked(scores: Sequence[float], source: Source = Source.NOVEL, **options: Any) -> int:
         fixed = Fixed(scores)
-        kept(fixed, source, SearchOptions(candidates=4, **options))
+        kept(fixed, source, SearchOptions(candidates=4, **{"sure": 0.95, **options}))
         return len(fixed.asked)
 
     assert asked([0.96, 0.97, 0.99, 0.5]) == 1
@@ -211,10 +210,10 @@ def test_a_detection_belongs_to_the_model_of_its_label() -> None:
 
 def test_the_likeness_to_the_mesh_counts_where_the_novel_detector_looked() -> None:
     fixed = Fixed([0.6])
-    unlike, alike = (Detection(BOXES[0], None, s, "m", Source.NOVEL) for s in (0.3, 0.7))
+    unlike, alike = (Detection(BOXES[0], None, s, "m", Source.NOVEL) for s in (0.46, 0.66))
     found = [estimates_of(fixed, VIEW, [each], SearchOptions())[0].score for each in (unlike, alike)]
-    np.testing.assert_allclose(found, [0.6 / (0.6 + 0.4 * np.exp(0.6)), 0.6 / (0.6 + 0.4 * np.exp(-0.6))])
-    np.testing.assert_allclose(fixed.asked, [1 / (1 + np.exp(-0.6)), 1 / (1 + np.exp(0.6))])
+    np.testing.assert_allclose(found, [0.6 / (0.6 + 0.4 * np.exp(2)), 0.6 / (0.6 + 0.4 * np.exp(-2))])
+    np.testing.assert_allclose(fixed.asked, [1 / (1 + np.exp(-2)), 1 / (1 + np.exp(2))])
     for source in set(Source) - {Source.NOVEL}:
         [same] = estimates_of(fixed, VIEW, [dataclasses.replace(alike, source=source)], SearchOptions())
         assert same.score == 0.6
@@ -223,7 +222,7 @@ def test_the_likeness_to_the_mesh_counts_where_the_novel_detector_looked() -> No
 @pytest.mark.parametrize("source", [Source.NOVEL, Source.TRAINED])
 def test_detections_are_judged_by_their_poses(source: Source) -> None:
     fixed = Fixed([0.2, 0.7], BOXES[1:3])
-    detections = [Detection(box, None, 0.5, MODEL.name, source) for box in BOXES[:3]]
+    detections = [Detection(box, None, 0.56, MODEL.name, source) for box in BOXES[:3]]
     [found] = find_instances(lambda _: fixed, VIEW, [MODEL], detections, SearchOptions())
     assert [(d.box, d.score) for d in scored_by_poses(found)] == [(BOXES[2], 0.7), (BOXES[1], 0.2), (BOXES[0], 0.0)]
 

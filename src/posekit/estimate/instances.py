@@ -20,10 +20,6 @@ from posekit.mesh.model import ObjectModel
 from posekit.results import Detection, Estimate, Source
 from posekit.view import View
 
-# of the novel detector's similarity beside a refined pose's score, in log odds, and the one that says nothing; among
-# proposals that poses chose it tells little: docs/log.md, 2026-11-30
-POSED_WEIGHT, POSED_USUAL = 3.0, 0.5
-
 
 class Estimator(Protocol):
     """What a `PoseEstimator` does for the search."""
@@ -47,7 +43,7 @@ class SearchOptions:
     min_score: float = 0.5  # score of an estimate below which it is no instance
     overlap: float = 0.5  # of the boxes (intersection over union) from which two estimates are of one instance
     candidates: int = 3  # the novel detector's detections that are estimated, the most promising ones
-    sure: float = 0.95  # score from which an estimate is an instance whatever the remaining detections would give
+    sure: float = 0.98  # score from which an estimate is an instance whatever the remaining detections would give
 
     def __post_init__(self) -> None:
         shares = (self.min_score, self.sure)
@@ -124,13 +120,13 @@ def estimates_of(
 ) -> list[Estimate]:
     """An estimate for each detection that leads to one, in their order, until as many sure instances are found as are
     wanted; detections by hand are all estimated. What the novel detector found is scored by
-    how much it looks like the mesh as well: the log odds grow by `POSED_WEIGHT` times what the similarity is above
-    `POSED_USUAL`."""
+    how much it looks like the mesh as well: a logistic function's argument grows by `WEIGHT` times what the similarity
+    is above `USUAL` (docs/decisions/0015)."""
     found: list[Estimate] = []
     for detection in detections:
         if not detection.source.by_hand and _enough(found, options):
             break
-        shift = POSED_WEIGHT * (detection.score - POSED_USUAL) if detection.source is Source.NOVEL else 0.0
+        shift = WEIGHT * (detection.score - USUAL) if detection.source is Source.NOVEL else 0.0
         for estimate in estimator.estimate(view, [detection], shifted(options.min_score, -shift)):
             others = tuple(replace(e, score=shifted(e.score, shift)) for e in estimate.alternatives)
             found.append(replace(estimate, score=shifted(estimate.score, shift), alternatives=others))
