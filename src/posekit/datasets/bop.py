@@ -15,7 +15,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import PIL.Image
 from numpy.typing import NDArray
 
 from posekit.camera import Box, Camera
@@ -23,7 +22,7 @@ from posekit.errors import CameraError, ImageError, InputError, MeshError
 from posekit.geometry import Pose
 from posekit.io.calibration import calibration_of_entry
 from posekit.io.files import read_text
-from posekit.io.load import load_image, load_mask, pose_from_bop
+from posekit.io.load import load_image, load_mask, picture_size, pose_from_bop
 from posekit.mesh.model import ObjectModel
 from posekit.mesh.units import UNITS
 from posekit.view import View
@@ -203,12 +202,7 @@ class BopDataset:
 
     def picture_size(self, scene: int, image: int) -> tuple[int, int]:
         """A photograph's (width, height), from its header."""
-        path = self.image_path(scene, image)
-        try:
-            with PIL.Image.open(path) as picture:
-                return picture.size
-        except OSError as error:
-            raise ImageError(f"the picture {path} is damaged ({error}): make or copy it again.") from error
+        return picture_size(self.image_path(scene, image))
 
     def depth(self, scene: int, image: int) -> NDArray[np.float32] | None:
         """The sensor's depth (H, W), metres, 0 where it saw nothing; None where the data set has none."""

@@ -34,16 +34,15 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import PIL.Image
 from numpy.typing import NDArray
 
 from posekit.camera import Camera
 from posekit.datasets.bop import BopDataset, Instance, MeasuredModel
 from posekit.datasets.linemod import DeepimDataset
-from posekit.errors import CameraError, ConfigError, ImageError, InputError, MeshError
+from posekit.errors import CameraError, ConfigError, InputError, MeshError
 from posekit.geometry import Pose
 from posekit.io.files import read_text
-from posekit.io.load import load_image, pose_from_bop
+from posekit.io.load import load_image, picture_size, pose_from_bop
 from posekit.mesh.model import ObjectModel
 from posekit.view import View
 
@@ -135,12 +134,7 @@ class SequenceDataset:
 
     def picture_size(self, scene: int, image: int) -> tuple[int, int]:
         """A frame's (width, height), from its header. Raises ImageError where it is damaged."""
-        path = self.image_path(scene, image)
-        try:
-            with PIL.Image.open(path) as picture:
-                return picture.size
-        except OSError as error:
-            raise ImageError(f"the picture {path} is damaged ({error}): copy it again.") from error
+        return picture_size(self.image_path(scene, image))
 
     def camera(self, scene: int, _image: int, size: tuple[int, int]) -> Camera:
         """The sequence's camera; size: (width, height) in pixels."""

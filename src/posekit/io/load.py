@@ -102,6 +102,15 @@ def load_image(path: str | Path) -> NDArray[np.uint8]:
         return _rgb(upright(image, path.name), path.name)
 
 
+def picture_size(path: Path) -> Size:
+    """A picture's (width, height), from its header. Raises ImageError where it is damaged."""
+    try:
+        with Image.open(path) as picture:
+            return picture.size
+    except OSError as error:
+        raise ImageError(f"the picture {path} is damaged ({error}): make or copy it again.") from error
+
+
 def load_mask(path: str | Path, size: Size | None = None, *, allow_empty: bool = False) -> NDArray[np.bool_]:
     """A mask (H, W) from a picture: True where a pixel is brighter than half of the brightest (and not transparent).
 
