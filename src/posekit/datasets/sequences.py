@@ -28,6 +28,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -66,7 +67,7 @@ class Sequence3D:
     second: tuple[int, Sequence[Pose]] | None = None
 
 
-class SequenceDataset:
+class SequenceDataset(ABC):
     """Sequences with one object each. meshes: files by number. units: of the meshes; auto is mm.
 
     A scene's number is a hundred times that of its variant or place, from 1 on, plus that of its object.
@@ -80,9 +81,9 @@ class SequenceDataset:
         self._loaded: dict[int, ObjectModel] = {}
 
     @cached_property
+    @abstractmethod
     def sequences(self) -> dict[int, Sequence3D]:
         """The sequences by the numbers of their scenes. Raises InputError."""
-        raise NotImplementedError
 
     def sequence(self, scene: int) -> Sequence3D:
         """A scene's sequence. Raises InputError where there is none of this number."""

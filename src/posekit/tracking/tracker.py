@@ -69,12 +69,12 @@ SURE = 0.6  # share of a silhouette with the object's colours from which on a fr
 # what contradicts a pose: less than this share of its outline within NEAR_PX pixels of where the colours put it; less
 # than this share of the first silhouette's contrast; a predicted angle (degrees) and a median distance of the network's
 # correspondences (pixels) above these and above TWICE what they usually are. CONTRADICTED of the four are needed.
-# Chosen on made sequences: docs/decisions/0024
+# Chosen on made sequences: docs/decisions/0026
 BORNE_OUT, NEAR_PX, LESS_CONTRAST, WIDE_DEG, WIDE_PX, TWICE = 0.5, 1.5, 0.7, 10.0, 1.5, 2.0
 CONTRADICTED, USUAL_RATE = 2, 0.1
 # what `Tracker._recalled` changes
 FOLLOWED = ("_state", "_before", "_colours", "_tint", "_motion", "_doubts", "_separated", "_separated_first",
-            "_separated_usual", "_bias", "_waiting", "_contradictions", "_contradicted")  # fmt: skip
+            "_separated_usual", "_usual", "_bias", "_waiting", "_contradictions", "_contradicted")  # fmt: skip
 
 _ONE_SEARCH = Lock()  # detectors and estimators are shared by trackers, and searches take a core each
 
