@@ -17,6 +17,7 @@ KINDS = {
     "templates-*": "views of meshes that first poses are compared with",
     "features": "local features of meshes",
     "meshes": "large meshes as they were read",
+    "meshes-small": "other meshes as they were read",
     "light": "large meshes as they are drawn",
 }
 

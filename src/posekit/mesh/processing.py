@@ -1,4 +1,7 @@
-"""Normals, hulls, simplification and checks of vertices and faces, as arrays."""
+"""Normals, hulls, simplification and checks of vertices and faces, as arrays.
+
+SciPy takes a quarter of a second to import, and a mesh that is kept on disk does without: functions import it.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +9,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import csr_array
-from scipy.spatial import ConvexHull, KDTree
 
 from posekit.errors import MeshError
 
@@ -78,6 +79,8 @@ def _distinct(vertex: NDArray[np.int64], normal: NDArray[np.int64]) -> tuple[NDA
 
 def counting_order(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
     """As ``np.argsort(numbers, kind="stable")`` of whole numbers from 0 on without large gaps, in linear time."""
+    from scipy.sparse import csr_array
+
     ones, rows = np.ones(len(numbers), dtype=np.int8), np.arange(len(numbers) + 1)
     return np.asarray(csr_array((ones, numbers, rows)).tocsc().indices)  # one number in each row, and rows by column
 
@@ -121,6 +124,8 @@ def mean_colors(
     fewer: NDArray[np.float32], vertices: NDArray[np.float32], colors: NDArray[np.uint8]
 ) -> NDArray[np.uint8]:
     """Of the vertices that each of fewer ones (V, 3) is nearest to; where there are none, of the nearest."""
+    from scipy.spatial import KDTree
+
     _, owner = KDTree(fewer).query(vertices, workers=-1)
     count = np.bincount(owner, minlength=len(fewer))
     sums = np.stack([np.bincount(owner, channel, minlength=len(fewer)) for channel in colors.T], axis=1)
@@ -137,6 +142,8 @@ def carried_uvs(
     corners: (F, 3, 3), corner_uvs: (F, 3, 2), the old faces'. A vertex on a seam is split. Returns the source vertex of
     each new one (V',), the new faces and the coordinates (V', 2).
     """
+    from scipy.spatial import KDTree
+
     new = vertices[faces].astype(np.float64)
     _, under = KDTree(corners.mean(axis=1)).query(new.mean(axis=1))
     origin, first, second = np.moveaxis(corners[under].astype(np.float64), 1, 0)
@@ -177,6 +184,8 @@ def subdivided(
 
 def convex_hull(points: Floats) -> Floats:
     """The corners (N, 3) of the convex hull of points (V, 3), flat ones too."""
+    from scipy.spatial import ConvexHull
+
     middle = points.mean(axis=0)
     _, spread, axes = np.linalg.svd((points - middle).T @ (points - middle))
     rank = 3 if spread[2] > 1e-12 * spread[0] else 2
