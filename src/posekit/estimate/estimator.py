@@ -114,6 +114,7 @@ class PoseEstimator:
             networks = Runtime(preset, weights, device=device, runtime=runtime, networks=networks)
         self.runtime = networks
         self.refine_options = options.refine_options(networks.dense)
+        networks.start()
         self.renderer = Renderer()
         self._search: FirstPoseSearch | None = None  # in place of the search by boxes
         self._features = FeatureSearch(model, self.renderer)
