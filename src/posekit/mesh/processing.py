@@ -31,14 +31,15 @@ def smooth_normals(vertices: Floats, faces: NDArray[np.int64]) -> tuple[NDArray[
     order = counting_order(place)
     place = place[order]
     ends = np.cumsum(np.bincount(place))  # of the corners of each place, which lie side by side
-    unit = np.empty((len(order), 3))
+    unit, steps = np.empty((len(order), 3)), np.empty((len(order), 3), np.int16)
     start = 0
     while start < len(order):
         end = int(ends[place[min(start + _PORTION, len(order)) - 1]])
         part = order[start:end]
-        unit[part] = _smoothed(flat[part // 3], angles.ravel()[part], ends[place[start:end]] - start)
+        smoothed = _smoothed(flat[part // 3], angles.ravel()[part], ends[place[start:end]] - start)
+        unit[part], steps[part] = smoothed, np.rint(smoothed * _STEPS)
         start = end
-    first, inverse = _distinct(faces.ravel(), np.rint(unit * _STEPS).astype(np.int64))
+    first, inverse = _distinct(faces.ravel(), steps)
     return faces.ravel()[first], inverse.reshape(-1, 3), unit[first]
 
 
@@ -57,7 +58,7 @@ def _smoothed(normal: Floats, angle: Floats, ends: NDArray[np.int64]) -> Floats:
     return np.asarray(np.where(length > 1e-9, total, normal) / np.where(length > 1e-9, length, 1.0))
 
 
-def _distinct(vertex: NDArray[np.int64], normal: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _distinct(vertex: NDArray[np.int64], normal: NDArray[np.int16]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The distinct pairs of a vertex (N,) and a normal (N, 3) in units of 1 / `_STEPS`, sorted: where each is first,
     and which of them each pair is."""
     side = 2 * _STEPS + 1
@@ -129,8 +130,10 @@ def mean_colors(
     _, owner = KDTree(fewer).query(vertices, workers=-1)
     count = np.bincount(owner, minlength=len(fewer))
     sums = np.stack([np.bincount(owner, channel, minlength=len(fewer)) for channel in colors.T], axis=1)
-    _, nearest = KDTree(vertices).query(fewer)
-    means = np.where(count[:, None] > 0, sums / np.maximum(count, 1)[:, None], colors[nearest])
+    means = sums / np.maximum(count, 1)[:, None]
+    alone = np.flatnonzero(count == 0)
+    if alone.size:  # the tree of all vertices takes as long as everything else
+        means[alone] = colors[KDTree(vertices).query(fewer[alone])[1]]
     return np.asarray(np.rint(means), np.uint8)
 
 
