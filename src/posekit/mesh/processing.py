@@ -5,6 +5,9 @@ SciPy takes a quarter of a second to import, and a mesh that is kept on disk doe
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -32,13 +35,16 @@ def smooth_normals(vertices: Floats, faces: NDArray[np.int64]) -> tuple[NDArray[
     place = place[order]
     ends = np.cumsum(np.bincount(place))  # of the corners of each place, which lie side by side
     unit, steps = np.empty((len(order), 3)), np.empty((len(order), 3), np.int16)
-    start = 0
-    while start < len(order):
-        end = int(ends[place[min(start + _PORTION, len(order)) - 1]])
+    portions = [0]
+    while portions[-1] < len(order):
+        portions.append(int(ends[place[min(portions[-1] + _PORTION, len(order)) - 1]]))
+
+    def smooth(start: int, end: int) -> None:
         part = order[start:end]
         smoothed = _smoothed(flat[part // 3], angles.ravel()[part], ends[place[start:end]] - start)
         unit[part], steps[part] = smoothed, np.rint(smoothed * _STEPS)
-        start = end
+
+    _in_threads(smooth, portions)
     first, inverse = _distinct(faces.ravel(), steps)
     return faces.ravel()[first], inverse.reshape(-1, 3), unit[first]
 
@@ -89,8 +95,9 @@ def counting_order(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
 def _face_normals(vertices: Floats, faces: NDArray[np.int64]) -> tuple[Floats, Floats]:
     """Unit normals (F, 3) and the angles (F, 3) at the corners."""
     normals, angles = np.empty((len(faces), 3)), np.empty((len(faces), 3))
-    for start in range(0, len(faces), _PORTION):
-        part = slice(start, start + _PORTION)
+
+    def fill(start: int, end: int) -> None:
+        part = slice(start, end)
         corners = vertices[faces[part]]
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normals[part] = normal / np.linalg.norm(normal, axis=1, keepdims=True)
@@ -98,7 +105,20 @@ def _face_normals(vertices: Floats, faces: NDArray[np.int64]) -> tuple[Floats, F
         edges /= np.maximum(np.linalg.norm(edges, axis=2, keepdims=True), 1e-300)
         cosines = -np.einsum("fij,fij->fi", edges, np.roll(edges, 1, axis=1))
         angles[part] = np.arccos(cosines.clip(-1, 1))
+
+    _in_threads(fill, [*range(0, len(faces), _PORTION), len(faces)])
     return normals, angles
+
+
+def _in_threads(work: Callable[[int, int], None], limits: Sequence[int]) -> None:
+    """Call ``work`` with each pair of neighbouring limits, two at a time: NumPy lets other threads run meanwhile."""
+    pairs = list(pairwise(limits))
+    if len(pairs) == 1:
+        work(*pairs[0])
+        return
+    with ThreadPoolExecutor(2) as pool:
+        for done in [pool.submit(work, *pair) for pair in pairs]:
+            done.result()
 
 
 def coincident(vertices: Floats) -> NDArray[np.int64]:
