@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import json
 import os
 import subprocess
 import sys
@@ -134,6 +135,27 @@ def test_an_estimate_needs_no_torch(kept: Path) -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False,
                           env={**os.environ, "XDG_CACHE_HOME": str(kept)})  # fmt: skip
     assert done.returncode == 0, done.stderr
+
+
+def test_the_command_imports_no_more_than_it_needs(kept: Path, example_folder: Path, tmp_path: Path) -> None:
+    """Where the converted network is kept, a pose from a box is found without PyTorch, and at a mesh's later uses
+    without what reads and measures meshes: these take long to import. Two processes, since that is what it is about."""
+    code = (
+        "import sys; from posekit.cli.app import app; app(sys.argv[1:], standalone_mode=False)\n"
+        "print([m for m in ('torch', 'trimesh', 'networkx', 'scipy', 'av') if m in sys.modules])"
+    )
+    arguments = ["estimate", example_folder / "photo.png", "--model", example_folder / "toy.ply", "--symmetry", "none",
+                 "--camera", "610,610,322,236", "--box", "251,139,456,294", "--out", tmp_path, "--force"]  # fmt: skip
+    seen, poses = [], []
+    for _ in range(2):
+        done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False,
+                              env={**os.environ, "XDG_CACHE_HOME": str(kept)})  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        seen.append(done.stdout.splitlines()[-1])
+        poses.append(json.loads((tmp_path / "result.json").read_text())["estimates"][0]["T_cam_obj"])
+    assert "torch" not in seen[0]
+    assert seen[1] == "[]"
+    assert poses[0] == poses[1]
 
 
 def test_a_conversion_reports_nothing_to_others(tmp_path: Path) -> None:
