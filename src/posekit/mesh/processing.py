@@ -18,7 +18,7 @@ from posekit.errors import MeshError
 _FARTHEST = 1e12  # of a vertex from the origin, in a file's own units
 _CREASE = np.cos(np.deg2rad(40.0))  # faces that meet more sharply are not smoothed together
 _STEPS = 10_000  # in which a normal's coordinates are told apart
-_PORTION = 200_000  # faces or corners that are worked on at a time, for the memory's sake
+_PORTION = 50_000  # faces or corners that are worked on at a time, for the memory's sake, and the processor's caches
 
 Floats = NDArray[np.float64]
 
