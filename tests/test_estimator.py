@@ -176,3 +176,29 @@ def test_a_frame_in_doubt_has_not_converged() -> None:
     for _ in range(2):
         found = tracker.step(photograph(model, TRUTH).image)
         assert found.estimate is not None and found.estimate.angle == 0.2 and not found.estimate.converged
+
+
+# --- a quick look at many proposals ------------------------------------------------------------------------------------
+
+
+def test_of_many_proposals_the_network_compares_those_that_similarity_and_evidence_speak_for(
+    networks: Networks, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("posekit.estimate.estimator.COMPARED", 3)
+    model = bracket()
+    view = photograph(model, TRUTH)
+    rows, columns = np.nonzero(view.mask)
+    right = (float(columns.min()), float(rows.min()), float(columns.max() + 1), float(rows.max() + 1))
+    elsewhere = [(20.0 + 90 * k, 20.0, 80.0 + 90 * k, 90.0) for k in range(4)]
+    estimator = oracle(model, TRUTH, networks)
+
+    def screened(*similarities: float) -> list[float]:
+        boxes = [*elsewhere, right]
+        proposals = zip(boxes, similarities, strict=True)
+        return estimator.screen(view, [Detection(box, None, s, model.name, Source.NOVEL) for box, s in proposals])
+
+    scores = screened(0.5, 0.5, 0.5, 0.1, 0.5)
+    assert np.isfinite(scores).sum() == 3 and np.isfinite(scores[4]) and scores[3] == -np.inf
+    assert np.argmax(scores) == 4
+    assert screened(0.5, 0.5, 0.5, 0.1, 0.0)[4] == -np.inf, "too unlike the mesh"
+    assert estimator.screen(view, []) == []

@@ -14,6 +14,7 @@ import numpy as np
 
 from posekit.align.mask_edge import fit_mask_edge
 from posekit.camera import Box, mask_box
+from posekit.detect.similarity import USUAL, WEIGHT
 from posekit.errors import ConfigError
 from posekit.estimate.refine import Refinement, RefineOptions, compare, predicted_angle, refine, update_pose
 from posekit.first_pose.features import FeatureSearch
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("posekit")
 
 SCREENED_POSES, SCREENED_EVIDENCE = 2, 2.0  # first poses of a detection that is screened; weight of their evidence
+COMPARED, COMPARED_EVIDENCE = 12, 6.0  # detections whose first poses the network compares; weight of their evidence
 INITS = ("templates", "mvnet")
 AUTO = "auto"  # correspondences where the network gives them, else the regressed delta
 STRUCTURE, BLUR, ANGLE, BIAS = 5.7, -1.6, -1.6, 1.2  # of `existence_score`, fitted: docs/decisions/0020
@@ -169,18 +171,15 @@ class PoseEstimator:
 
     def screen(self, view: View, detections: Sequence[Detection]) -> list[float]:
         """How much each detection's first poses, updated once, speak for the object: log odds of `existence_score` and
-        the evidence of the search, the best of `SCREENED_POSES`; -inf where there is no first pose. Much quicker than
+        the evidence of the search, the best of `SCREENED_POSES`; -inf where there is no first pose, or where the
+        detection's similarity and the evidence leave it behind `COMPARED` others. Much quicker than
         `estimate`."""
-        found = [
-            (k, hypothesis)
-            for k, detection in enumerate(detections)
-            for hypothesis in self._box_search.search(view, replace(detection, mask=None), SCREENED_POSES, moved=False)
-        ]
         scores = np.full(len(detections), -np.inf)
+        found = self._compared_poses(view, detections)
         if not found:
             return scores.tolist()
-        poses = [hypothesis.T_cam_obj for _, hypothesis in found]
         hull, update = self.model.hull_ctr, self.refine_options.update
+        poses = [hypothesis.T_cam_obj for _, hypothesis in found]
         compared = zip(poses, *compare(view, self.model, hull, poses, self.predictor, self.renderer), strict=True)
         updated = [update_pose(T, self.model, p, o, d, update) or T for T, p, o, d in compared]
         compared_again = zip(*compare(view, self.model, hull, updated, self.predictor, self.renderer), strict=True)
@@ -189,6 +188,20 @@ class PoseEstimator:
             odds = np.log(max(exists, 1e-6) / max(1 - exists, 1e-6)) + SCREENED_EVIDENCE * hypothesis.score
             scores[k] = max(scores[k], odds)
         return scores.tolist()
+
+    def _compared_poses(self, view: View, detections: Sequence[Detection]) -> list[tuple[int, Hypothesis]]:
+        """First poses with the numbers of their detections: of those `COMPARED` whose similarity and evidence are
+        best."""
+        poses = [
+            self._box_search.search(view, replace(detection, mask=None), SCREENED_POSES, moved=False)
+            for detection in detections
+        ]
+        odds = [
+            WEIGHT * (detection.score - USUAL) + COMPARED_EVIDENCE * max((h.score for h in mine), default=-np.inf)
+            for detection, mine in zip(detections, poses, strict=True)
+        ]
+        best = sorted(np.argsort(np.negative(odds), kind="stable")[:COMPARED])
+        return [(int(k), hypothesis) for k in best for hypothesis in poses[k]]
 
     def refine(self, view: View, T_cam_obj: Pose) -> Estimate:
         """Refine a known pose; view.mask, where there is one, helps. Where it does not converge within a few
