@@ -55,6 +55,7 @@ ANGLE_OF_DOUBLE = math.radians(4.0)  # predicted angle at which that number doub
 TINT_RATE = 0.15  # weight of a frame in the running tint
 # contrast of a silhouette, to the usual one, below which turned poses are tried too; by how much they are turned
 LESS_SEPARATED, TURNED = 0.88, math.radians(25.0)
+TURNED_MARGIN = 0.02
 COARSE = 1500  # of the mesh that is drawn where the outline is looked for in smaller crops
 FACES = 6000  # of the mesh that is drawn: a crop shows no more
 LEAST_SCALE, KNEE = 0.5, 2.5  # pixels, no correspondence is more exact; standard deviations
@@ -451,7 +452,8 @@ class Tracker:
                 start = replace(predicted, pose=Pose(so3_exp(TURNED * axis) @ best.R, best.t))
                 candidates.append(self._aligned(view, start, colours, coarse))
                 qualities.append(self._separation(view, candidates[-1].pose, colours))
-        best_of = int(np.argmax(np.array(qualities) - [0.0, *[self.config.margin] * (len(candidates) - 1)]))
+        margins = [0.0, *[self.config.margin] * len(aligned), *[TURNED_MARGIN] * (len(candidates) - 1 - len(aligned))]
+        best_of = int(np.argmax(np.array(qualities) - margins))
         return self._aligned(view, candidates[best_of], colours, [fine])
 
     def _separation(self, view: View, T_cam_ctr: Pose, colours: Colours) -> float:
