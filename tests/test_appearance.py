@@ -12,7 +12,7 @@ from posekit.geometry import Pose, so3_exp
 from posekit.mesh.model import ObjectModel
 from posekit.metrics import pose_error
 from posekit.render import Renderer
-from posekit.tracking.appearance import APART, MOST, Appearance, colours_agree
+from posekit.tracking.appearance import APART, MISSED, MOST, Appearance, colours_agree
 from posekit.tracking.points import Keyframe, match_texture
 from test_track import looked, parcel, path, photograph
 
@@ -68,12 +68,37 @@ def test_what_hides_the_object_is_not_learned(renderer: Renderer) -> None:
     assert len(appearance.looks) == 1, "hidden for the most part"
 
 
+def test_what_hid_the_object_is_forgotten(renderer: Renderer) -> None:
+    model = parcel()
+    at = looked(photograph(renderer, model, path(model, 0)), plain(model), renderer, path(model, 0))
+    appearance = learned(model, renderer, path(model, 0))
+    left = np.broadcast_to(np.arange(160) < 80, (120, 160))
+    for k in range(2 * MISSED):
+        _, known = appearance.painted(at.drawn, at.T_view_ctr)
+        assert known[left].any() == (k < MISSED) and known[~left].any()
+        appearance.compare(left, ~left)
+    appearance = learned(model, renderer, path(model, 0))
+    for other in [left, left, left, ~left] * 2:  # not in a row
+        _, known = appearance.painted(at.drawn, at.T_view_ctr)
+        appearance.compare(other, ~left)
+    assert known[left].any()
+
+
 def test_kept_views_are_apart_and_few(renderer: Renderer) -> None:
     model = parcel()
     appearance = learned(model, renderer, path(model, 0))
     step = np.rad2deg(APART)
     there = [turned(model, degrees) @ model.T_obj_ctr for degrees in (0.5 * step, 1.5 * step)]
     assert [appearance.wants(pose) for pose in there] == [False, True]
+    at = looked(photograph(renderer, model, path(model, 0)), plain(model), renderer, path(model, 0))
+    appearance.painted(at.drawn, at.T_view_ctr)
+    assert at.drawn.mask is not None
+    appearance.compare(np.zeros_like(at.drawn.mask), at.drawn.mask)
+    assert not appearance.wants(there[0])
+    appearance.looks[0].points[:, :80] = np.nan
+    appearance.painted(at.drawn, at.T_view_ctr)
+    appearance.compare(np.zeros_like(at.drawn.mask), at.drawn.mask)
+    assert appearance.wants(there[0]), "half of what is seen was hidden then"
     appearance.looks *= MOST
     assert not appearance.wants(there[1])
 

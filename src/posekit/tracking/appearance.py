@@ -29,6 +29,8 @@ OFF_SURFACE = (
 )
 STEEP = 3.0  # pixels of a kept frame that such a distance may be, too: on steep surfaces neighbours are far apart
 LEAST_SHOWN = 0.5  # share of a silhouette that a kept frame shows
+LEAST_KNOWN = 0.7  # share of what a frame shows of the object, below which the frame is kept, too
+MISSED = 4  # frames in a row that show something else, after which a kept frame's pixel is taken for no part of it
 # the mesh's colours are taken for wrong where its chromaticities are further than this from the first frame's, in the
 # median, or where its brightness is correlated with the frame's less than this
 HUE_OFF, LEAST_CORRELATED = 0.06, 0.2
@@ -38,13 +40,14 @@ HUE_OFF, LEAST_CORRELATED = 0.06, 0.2
 class Look:
     """One frame's crop. image: uint8 RGB (H, W, 3). camera: of the crop. T_view_ctr: the pose in it. points: float32
     (H, W, 3), of the surface, metres in ``ctr``, NaN where the object's colour is not seen. direction: (3,), unit, from
-    the object's centre to the camera, in ``ctr``."""
+    the object's centre to the camera, in ``ctr``. missed: uint8 (H, W), for how many frames another colour was seen."""
 
     image: NDArray[np.uint8]
     camera: Camera
     T_view_ctr: Pose
     points: NDArray[np.float32]
     direction: NDArray[np.float64]
+    missed: NDArray[np.uint8]
 
 
 class Appearance:
@@ -56,13 +59,15 @@ class Appearance:
     def __init__(self, center: NDArray[np.float64], diameter: float) -> None:
         self.center, self.diameter = center, diameter
         self.looks: list[Look] = []
+        self._known = 1.0  # share of what the last compared frame shows of the object that was painted
+        # of the last drawing: kept frames, their pixels (N, 2), and the pixels (N,), (N,) painted with them
+        self._painted: list[tuple[Look, NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]] = []
 
     def wants(self, T_view_ctr: Pose) -> bool:
-        """Whether no kept frame shows this side."""
+        """Whether no kept frame shows this side, or too little of what the last compared frame showed of it."""
         direction = towards_camera(T_view_ctr)
-        return len(self.looks) < MOST and all(
-            float(direction @ look.direction) < math.cos(APART) for look in self.looks
-        )
+        apart = all(float(direction @ look.direction) < math.cos(APART) for look in self.looks)
+        return len(self.looks) < MOST and (apart or self._known < LEAST_KNOWN)
 
     def keep(self, seen: View, drawn: View, T_view_ctr: Pose, visible: Mask) -> None:
         """A frame's crop; drawn: the mesh at this pose, with mask and coords. visible: (H, W), where the crop shows the
@@ -71,10 +76,11 @@ class Appearance:
         shown = drawn.mask & visible & seen.shown
         if shown.sum() < LEAST_SHOWN * drawn.mask.sum():
             return
-        inner = cv2.erode(shown.astype(np.uint8), np.ones((2 * EDGE + 1, 2 * EDGE + 1), np.uint8)) > 0
+        inner = _inside(shown)
         points = np.where(inner[..., None], drawn.coords - self.center.astype(np.float32), np.float32(np.nan))
         direction = towards_camera(T_view_ctr)
-        self.looks.append(Look(seen.image, seen.camera, T_view_ctr, points, direction))
+        missed = np.zeros(shown.shape, np.uint8)
+        self.looks.append(Look(seen.image, seen.camera, T_view_ctr, points, direction, missed))
 
     def painted(self, drawn: View, T_view_ctr: Pose) -> tuple[NDArray[np.uint8], Mask]:
         """The drawing (uint8 RGB, H, W, 3) of a mesh with the colours of the kept frames, where one shows them, and
@@ -84,6 +90,7 @@ class Appearance:
         rows, columns = np.nonzero(drawn.mask)
         points = drawn.coords[rows, columns] - self.center.astype(np.float32)
         direction = towards_camera(T_view_ctr)
+        self._painted = []
         for look in sorted(self.looks, key=lambda each: -float(direction @ each.direction))[:USED]:
             if not len(points):
                 break
@@ -91,8 +98,23 @@ class Appearance:
             colours = cv2.remap(look.image, there[None, :, 0], there[None, :, 1], cv2.INTER_LINEAR)[0]
             image[rows[found], columns[found]] = colours[found]
             known[rows[found], columns[found]] = True
+            self._painted.append((look, np.rint(there[found]).astype(np.intp), rows[found], columns[found]))
             rows, columns, points = rows[~found], columns[~found], points[~found]
         return image, known
+
+    def compare(self, other: Mask, shown: Mask) -> None:
+        """What a frame told of the last drawing. other: (H, W), where it has another colour than was painted; shown:
+        (H, W), where it shows the object.
+
+        What hid the object in a kept frame is forgotten when the object is seen there for `MISSED` frames."""
+        inner, known = _inside(shown), 0
+        for look, pixels, rows, columns in self._painted:
+            known += int(inner[rows, columns].sum())
+            at = pixels[:, 1], pixels[:, 0]
+            look.missed[at] = np.where(other[rows, columns], np.minimum(look.missed[at] + 1, MISSED), 0)
+            gone = look.missed[at] >= MISSED
+            look.points[pixels[gone, 1], pixels[gone, 0]] = np.nan
+        self._known = known / max(1, int(inner.sum()))
 
     def _shown(self, look: Look, points: NDArray[np.float32]) -> tuple[NDArray[np.float32], Mask]:
         """Pixels (N, 2) of a kept frame at which points (N, 3) of ``ctr`` lie, and which of them it shows."""
@@ -109,6 +131,11 @@ class Appearance:
         limit = OFF_SURFACE * self.diameter + STEEP * float(look.T_view_ctr.t[2]) / camera.fx
         found = np.einsum("ni,ni->n", off, off) < limit**2  # never where it is NaN
         return there, np.asarray(found & (there >= 0).all(axis=1) & (there <= size).all(axis=1))
+
+
+def _inside(mask: Mask) -> Mask:
+    """Without `EDGE` pixels at its edge."""
+    return np.asarray(cv2.erode(mask.astype(np.uint8), np.ones((2 * EDGE + 1, 2 * EDGE + 1), np.uint8)) > 0)
 
 
 def colours_agree(seen: View, drawn: View, visible: Mask) -> bool:

@@ -340,7 +340,8 @@ class Tracker:
             apart = off_colour(seen, drawn)
             if known is not None:
                 apart = np.where(known[..., None], apart, tint.apart)
-            visible = colours.seen(seen) & ~tint.hides(apart, drawn.mask)
+            other = tint.hides(apart, drawn.mask)
+            visible = colours.seen(seen) & ~other
             answer = self._executor.submit(self._compared, seen, drawn, visible)
             # while the network computes
             keyframe = Keyframe(seen, drawn, T_view_ctr, visible)
@@ -367,6 +368,8 @@ class Tracker:
         share = float((visible & shown).sum() / max(1, shown.sum()))
         self._motion = Pose(state.pose.R @ last.R.T, state.pose.t - last.t)
         self._state, self._before = state, keyframe
+        if self._appearance is not None:
+            self._appearance.compare(other, visible & drawn.mask & seen.shown)
         self._separated = contrast(seen, drawn.mask, colours)
         self._contradictions = self._contradicting(keyframe, prediction, more, there)
         if (
