@@ -99,8 +99,13 @@ def test_kept_views_are_apart_and_few(renderer: Renderer) -> None:
     appearance.painted(at.drawn, at.T_view_ctr)
     appearance.compare(np.zeros_like(at.drawn.mask), at.drawn.mask)
     assert appearance.wants(there[0]), "half of what is seen was hidden then"
+    first = appearance.looks[0]
     appearance.looks *= MOST
-    assert not appearance.wants(there[1])
+    assert not appearance.wants(there[0]) and appearance.wants(there[1])
+    at = looked(photograph(renderer, model, turned(model, 40)), plain(model), renderer, turned(model, 40))
+    appearance.keep(at.seen, at.drawn, at.T_view_ctr, at.visible)
+    assert len(appearance.looks) == MOST and appearance.looks[0] is first
+    assert appearance.looks[-1].image is at.seen.image
 
 
 def test_learned_texture_leads_to_the_frame(renderer: Renderer) -> None:

@@ -67,7 +67,7 @@ class Appearance:
         """Whether no kept frame shows this side, or too little of what the last compared frame showed of it."""
         direction = towards_camera(T_view_ctr)
         apart = all(float(direction @ look.direction) < math.cos(APART) for look in self.looks)
-        return len(self.looks) < MOST and (apart or self._known < LEAST_KNOWN)
+        return apart or (self._known < LEAST_KNOWN and len(self.looks) < MOST)
 
     def keep(self, seen: View, drawn: View, T_view_ctr: Pose, visible: Mask) -> None:
         """A frame's crop; drawn: the mesh at this pose, with mask and coords. visible: (H, W), where the crop shows the
@@ -81,6 +81,10 @@ class Appearance:
         direction = towards_camera(T_view_ctr)
         missed = np.zeros(shown.shape, np.uint8)
         self.looks.append(Look(seen.image, seen.camera, T_view_ctr, points, direction, missed))
+        if len(self.looks) > MOST:  # one of the two that are most alike; the first one's pose is the surest
+            directions = np.stack([look.direction for look in self.looks])
+            alike = directions @ directions.T - 2 * np.eye(len(directions))
+            del self.looks[1 + int(np.argmax(alike[1:].max(axis=1)))]
 
     def painted(self, drawn: View, T_view_ctr: Pose) -> tuple[NDArray[np.uint8], Mask]:
         """The drawing (uint8 RGB, H, W, 3) of a mesh with the colours of the kept frames, where one shows them, and
