@@ -85,3 +85,21 @@ def test_a_quarter_turn_of_silhouettes_and_picture_changes_nothing() -> None:
     both = Silhouettes.joined([drawn, drawn.turned()])
     np.testing.assert_allclose(both.scores(upright)[:2], both.scores(turned)[2:], atol=0.02)
     np.testing.assert_array_equal(both.chosen(np.array([3, 0])).scores(turned), both.scores(turned)[[3, 0]])
+
+
+def test_packed_silhouettes_are_the_same() -> None:
+    image, mask = scene()
+    drawn = Silhouettes.of([mask, ellipse((20, 30), (9, 5)), np.zeros_like(mask)], [image, image, image])
+    again = Silhouettes.unpacked(drawn.packed(), mask.size)
+    for name in ("masks", "colours", "edges", "normals", "starts"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(drawn, name), strict=True)
+
+
+def test_turned_silhouettes_are_turned_pictures() -> None:
+    image, mask = scene()
+    masks = [mask, ellipse((20, 30), (9, 5))]
+    turned = Silhouettes.of(masks, [image, image]).turned()
+    again = Silhouettes.of([np.ascontiguousarray(np.rot90(m, -1)) for m in masks],
+                           [np.ascontiguousarray(np.rot90(image, -1))] * 2)  # fmt: skip
+    np.testing.assert_array_equal(turned.masks, again.masks)
+    np.testing.assert_allclose(turned.colours, again.colours, atol=1)  # rounding of the mean

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from objects import CAMERA, bracket
 from posekit.camera import mask_box
 from posekit.errors import WeightsError
 from posekit.estimate.refine import crops
-from posekit.first_pose.hypotheses import BoxSearch, EvidenceScorer, TemplateSearch, agreement_of
+from posekit.first_pose.hypotheses import BoxOptions, BoxSearch, EvidenceScorer, TemplateSearch, agreement_of
 from posekit.first_pose.mvnet import MVNetSearch
 from posekit.geometry import Pose, random_rotation, rotation_angle, so3_exp
 from posekit.nets.config import PaperConfig
@@ -76,6 +77,29 @@ def test_a_box_is_enough(renderer: Renderer) -> None:
     assert np.mean(np.array(near) < 25) >= 0.85 and np.median(depths) < 0.08
     empty = dataclasses.replace(detection, mask=np.zeros((480, 640), bool))
     assert search.search(view, empty, 5) == []
+
+
+def test_kept_silhouettes_are_the_same_and_damaged_ones_are_made_anew(
+    renderer: Renderer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    model, options = bracket(), BoxOptions(views=12)
+    first = BoxSearch(model, renderer, options)
+    [file] = (tmp_path / "posekit" / "silhouettes").iterdir()
+    place, calls = BoxSearch._place, []
+    monkeypatch.setattr(BoxSearch, "_place", lambda *args: calls.append(0) or place(*args))
+    for damage, made in ((False, 0), (True, 72), (False, 0)):
+        if damage:
+            file.write_bytes(file.read_bytes()[:-2000])
+        calls.clear()
+        again = BoxSearch(model, renderer, options)
+        assert len(calls) == made
+        for name in ("masks", "colours", "edges", "normals", "starts"):
+            values = getattr(again.silhouettes, name), getattr(first.silhouettes, name)
+            np.testing.assert_array_equal(*values, strict=True)
+        assert [dataclasses.astuple(p)[:4] for p in again.placed] == [dataclasses.astuple(p)[:4] for p in first.placed]
+        np.testing.assert_array_equal([p.offset for p in again.placed], [p.offset for p in first.placed])
+    assert len(BoxSearch(model, renderer, BoxOptions(views=6)).placed) == 6 * 24, "other options are not mixed up"
 
 
 def test_hypotheses_lie_apart_and_an_empty_mask_gives_none(renderer: Renderer) -> None:

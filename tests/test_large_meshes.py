@@ -31,11 +31,32 @@ def sphere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_a_large_mesh_is_the_same_from_the_cache(sphere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first = ObjectModel.load(sphere)
-    monkeypatch.setattr("posekit.mesh.model.read_parts", lambda path: pytest.fail("it was read again"))
+    monkeypatch.setattr("posekit.mesh.reading.read_parts", lambda path: pytest.fail("it was read again"))
     again = ObjectModel.load(sphere)
     for name in ("vertices", "faces", "normals", "colors", "hull_vertices"):
         np.testing.assert_array_equal(getattr(again, name), getattr(first, name), strict=True)
     assert (again.name, again.units, again.digest) == ("sphere", "mm", first.digest)
+    assert again.diameter == first.diameter
+
+
+def test_a_small_mesh_of_plain_properties_is_kept_too(sphere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kept, "FACES", 100_000)
+    monkeypatch.setattr(kept, "_BYTES", 5_000_000)
+    first = ObjectModel.load(sphere)
+    monkeypatch.setattr("posekit.mesh.reading.read_parts", lambda path: pytest.fail("it was read again"))
+    again = ObjectModel.load(sphere)
+    for name in ("vertices", "faces", "normals", "colors", "hull_vertices"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(first, name), strict=True)
+    assert again.diameter == first.diameter
+    [file] = (sphere.parent / "cache").rglob("*.npz")
+    assert file.parent.name == "meshes-small"
+
+
+def test_a_small_mesh_of_other_properties_is_read_each_time(sphere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kept, "FACES", 100_000)
+    sphere.write_bytes(sphere.read_bytes().replace(b"uchar alpha", b"uchar gray0", 1))
+    ObjectModel.load(sphere)
+    assert not list((sphere.parent / "cache").rglob("*.npz"))
 
 
 def test_a_changed_mesh_and_other_units_are_read_anew(sphere: Path) -> None:
@@ -52,6 +73,23 @@ def test_a_damaged_kept_mesh_is_read_anew(sphere: Path) -> None:
     [file] = (sphere.parent / "cache").rglob("*.npz")
     file.write_bytes(file.read_bytes()[:1000])
     np.testing.assert_array_equal(ObjectModel.load(sphere).vertices, first.vertices)
+
+
+def test_whether_a_light_copy_is_there(sphere: Path) -> None:
+    model = ObjectModel.load(sphere)
+    assert not light.has_light_copy(model)
+    copy = light.light_copy(model)
+    for each in (model, copy, ObjectModel.load(sphere)):
+        assert light.has_light_copy(each)
+
+
+def test_normals_do_not_depend_on_portions(sphere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh = ObjectModel.load(sphere)
+    arguments = mesh.vertices.astype(np.float64), mesh.faces.astype(np.int64)
+    whole = processing.smooth_normals(*arguments)
+    monkeypatch.setattr(processing, "_PORTION", 700)  # several of them: in threads
+    for one, other in zip(processing.smooth_normals(*arguments), whole, strict=True):
+        np.testing.assert_array_equal(one, other, strict=True)
 
 
 def test_the_light_copy_looks_like_the_mesh(sphere: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import gc
+import json
 import os
 import subprocess
 import sys
+import threading
 import weakref
 from pathlib import Path
 
@@ -92,6 +94,36 @@ def test_a_missing_openvino_is_said(monkeypatch: pytest.MonkeyPatch, caplog: pyt
     assert "OpenVINO cannot be used" in caplog.text
 
 
+def test_a_started_predictor_is_the_predictor(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is loaded in another thread, once, and what goes wrong there is raised where it is used."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(kept))
+    runtime, load, threads = Runtime(runtime="openvino"), Runtime.predictor_for, []
+    monkeypatch.setattr(
+        Runtime, "predictor_for", lambda *args: threads.append(threading.current_thread()) or load(*args)
+    )
+    runtime.start()
+    runtime.start()
+    assert runtime.predictor is runtime.predictor
+    runtime.start()
+    assert len(threads) == 1
+    assert threads[0] is not threading.main_thread()
+
+    def fails(*args: object) -> None:
+        raise RuntimeError("no such processor")
+
+    monkeypatch.setattr(Runtime, "predictor_for", fails)
+    broken = Runtime(runtime="openvino")
+    broken.start()
+    with pytest.raises(RuntimeError, match="no such processor"):
+        _ = broken.predictor
+
+
+def test_an_unconverted_network_is_not_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(Runtime, "predictor_for", lambda *args: pytest.fail("it was loaded"))
+    Runtime(runtime="openvino").start()
+
+
 def test_an_estimate_needs_no_torch(kept: Path) -> None:
     """Where the converted network is kept, a pose from a box is found without importing PyTorch, which takes long."""
     code = (
@@ -103,6 +135,27 @@ def test_an_estimate_needs_no_torch(kept: Path) -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False,
                           env={**os.environ, "XDG_CACHE_HOME": str(kept)})  # fmt: skip
     assert done.returncode == 0, done.stderr
+
+
+def test_the_command_imports_no_more_than_it_needs(kept: Path, example_folder: Path, tmp_path: Path) -> None:
+    """Where the converted network is kept, a pose from a box is found without PyTorch, and at a mesh's later uses
+    without what reads and measures meshes: these take long to import. Two processes, since that is what it is about."""
+    code = (
+        "import sys; from posekit.cli.app import app; app(sys.argv[1:], standalone_mode=False)\n"
+        "print([m for m in ('torch', 'trimesh', 'networkx', 'scipy', 'av') if m in sys.modules])"
+    )
+    arguments = ["estimate", example_folder / "photo.png", "--model", example_folder / "toy.ply", "--symmetry", "none",
+                 "--camera", "610,610,322,236", "--box", "251,139,456,294", "--out", tmp_path, "--force"]  # fmt: skip
+    seen, poses = [], []
+    for _ in range(2):
+        done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False,
+                              env={**os.environ, "XDG_CACHE_HOME": str(kept)})  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        seen.append(done.stdout.splitlines()[-1])
+        poses.append(json.loads((tmp_path / "result.json").read_text())["estimates"][0]["T_cam_obj"])
+    assert "torch" not in seen[0]
+    assert seen[1] == "[]"
+    assert poses[0] == poses[1]
 
 
 def test_a_conversion_reports_nothing_to_others(tmp_path: Path) -> None:

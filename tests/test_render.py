@@ -17,8 +17,10 @@ import posekit
 from posekit.camera import Camera, mask_box
 from posekit.errors import RenderError
 from posekit.geometry import Pose, random_rotation, so3_exp
+from posekit.io.array_cache import keep_arrays, read_arrays
 from posekit.mesh.model import ObjectModel
 from posekit.render import Light, Renderer, context, info, render_views, view_rotations
+from posekit.render import renderer as renderer_module
 from raycaster import cast
 
 CAMERA = Camera(fx=210.0, fy=190.0, cx=70.25, cy=66.5, width=160, height=120)  # off its axis, fx != fy
@@ -573,6 +575,30 @@ def test_leaving_out_the_faces_behind_changes_no_picture(inside_out) -> None:
         np.testing.assert_array_equal(one.mask, other.mask)
         assert (np.abs(one.depth - other.depth) > 1e-6).sum() <= 2  # at the outline, faces seen edge-on
         assert (one.image != other.image).any(axis=-1).sum() <= 2
+
+
+def test_whether_faces_may_be_left_out_is_kept_on_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And looked at anew where the file is damaged, or was made by another OpenGL."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(renderer_module, "_KEPT_CHECK_FACES", 1000)
+    look, looked = Renderer._looks_alike_culled, []
+    monkeypatch.setattr(Renderer, "_looks_alike_culled", lambda *args: looked.append(0) or look(*args))
+
+    def culled() -> tuple[bool, int]:
+        model, renderer = pebble(), Renderer()
+        looked.clear()
+        renderer.render(model, [Pose(np.eye(3), [0, 0, 0.4])], CAMERA)
+        return renderer._meshes[model].culled, len(looked)
+
+    assert culled() == (True, 1)
+    assert culled() == (True, 0)
+    [file] = (tmp_path / "posekit" / "culled").iterdir()
+    file.write_bytes(file.read_bytes()[:-10])
+    assert culled() == (True, 1)
+    keep_arrays(file, {"culled": np.array(False), "drawn_by": np.array("another")})
+    assert culled() == (True, 1)
+    keep_arrays(file, read_arrays(file) | {"culled": np.array(False)})
+    assert culled() == (False, 0)
 
 
 def test_meshes_whose_faces_go_different_ways_round_are_drawn_whole(renderer) -> None:

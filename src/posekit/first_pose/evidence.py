@@ -8,8 +8,9 @@ across the silhouette.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -124,15 +125,33 @@ class Silhouettes:
     def turned(self) -> Silhouettes:
         """All by a quarter turn clockwise. Their pictures must be square."""
         side = round(self.masks.shape[1] ** 0.5)
-        square = (len(self), side, side)
         rows, columns = np.divmod(self.edges, side)
         return Silhouettes(
-            np.rot90(self.masks.reshape(square), -1, (1, 2)).reshape(len(self), -1),
-            np.rot90(self.colours.reshape(*square, 3), -1, (1, 2)).reshape(len(self), -1),
+            _turned(self.masks.reshape(-1, side, side)).reshape(len(self), -1),
+            _turned(self.colours.reshape(-1, side, side, 3)).reshape(len(self), -1),
             columns * side + side - 1 - rows,
             np.stack([-self.normals[:, 1], self.normals[:, 0]], 1),
             self.starts,
         )
+
+    def packed(self) -> dict[str, NDArray[Any]]:
+        """As arrays of a fifteenth of the size, for `unpacked`."""
+        inside = self.colours.reshape(*self.masks.shape, 3)[self.masks > 0]
+        return {
+            "masks": np.packbits(self.masks, axis=1),
+            "colours": inside,
+            "edges": self.edges,
+            "normals": self.normals,
+            "starts": self.starts,
+        }
+
+    @classmethod
+    def unpacked(cls, arrays: Mapping[str, NDArray[Any]], pixels: int) -> Silhouettes:
+        """What `packed` gave, of pictures of so many pixels."""
+        masks = np.unpackbits(arrays["masks"], axis=1, count=pixels)
+        colours = np.zeros((*masks.shape, 3), np.int8)
+        colours[masks > 0] = arrays["colours"]
+        return cls(masks, colours.reshape(len(masks), -1), arrays["edges"], arrays["normals"], arrays["starts"])
 
     def __len__(self) -> int:
         return len(self.masks)
@@ -170,6 +189,14 @@ class Silhouettes:
             both = masks @ picture.mask
             score += weights.overlap * both / np.maximum(masks.sum(1) + picture.mask.sum() - both, 1)
         return np.asarray(score, np.float32)
+
+
+def _turned(pictures: NDArray[Any]) -> NDArray[Any]:
+    """(T, S, S) or (T, S, S, 3) of bytes, each by a quarter turn clockwise: as one picture, many times as fast as by
+    NumPy."""
+    count, side, _, *channels = pictures.shape
+    wide = cv2.rotate(pictures.reshape(count * side, side, *channels), cv2.ROTATE_90_CLOCKWISE)
+    return wide.reshape(side, count, side, *channels)[:, ::-1].swapaxes(0, 1)
 
 
 def separation(inside: FArray, total: FArray) -> FArray:

@@ -37,6 +37,9 @@ Array = NDArray[np.float64]
 FArray = NDArray[np.float32]
 
 TEMPLATE_VERSION = 1  # of what is kept on disk; a change of the views raises it
+PLACED_VERSION = 1  # of the silhouettes that are kept; a change of what is done with templates raises it
+KEPT_SILHOUETTES = 50  # meshes whose silhouettes are kept, about 4 MB each
+KEPT_NAMES = {"masks", "colours", "edges", "normals", "starts", "placed", "made_for"}
 TEMPLATE = 64  # side of the box search's templates, pixels
 JUDGED = 96  # side of the window in which poses are judged, pixels
 FINER = 2  # times as fine as it is compared, a crop is kept
@@ -255,6 +258,17 @@ class _Placed:
         return _Placed(self.view, self.turn + 0.5 * np.pi, 1 / self.aspect, self.scale, offset)
 
 
+def _packed(placed: Sequence[_Placed]) -> Array:
+    """(N, 6): view, turn, aspect, scale, offset."""
+    return np.array([[each.view, each.turn, each.aspect, each.scale, *each.offset] for each in placed])
+
+
+def _unpacked(rows: Array) -> list[_Placed]:
+    return [
+        _Placed(int(view), turn, aspect, scale, np.array([x, y])) for view, turn, aspect, scale, x, y in rows.tolist()
+    ]
+
+
 MOVES = tuple(
     _Move(x, y, scale, turn)
     for x in (-1.5, 0.0, 1.5)
@@ -277,19 +291,36 @@ class BoxSearch:
         self.model, self.options, self.weights = model, options, weights_for(model, options.weights)
         self.rotations = [view_rotation(d) for d in fibonacci_sphere(options.views)]
         self.distance, self.camera = _template_camera(model)
-        views = template_views(model, renderer, options.views)
+        self.placed, first = self._first_quarter(renderer)
+        quarters, count = [first], len(first)
+        for _ in range(3):
+            quarters.append(quarters[-1].turned())
+            self.placed += [placed.turned() for placed in self.placed[-count:]]
+        self.silhouettes = Silhouettes.joined(quarters)
+        self.aspects = np.array([placed.aspect for placed in self.placed])
+
+    def _first_quarter(self, renderer: Renderer) -> tuple[list[_Placed], Silhouettes]:
+        """The templates, turned by less than a quarter: from the user's cache, else made and kept there. Raises
+        PromptError where the mesh leaves no silhouette."""
+        options = self.options
+        file = cache_file("silhouettes", self.model, 1000 * TEMPLATE_VERSION + PLACED_VERSION)
+        made_for = np.array([options.views, options.turns, options.side, options.root])
+        kept = read_arrays(file)
+        if kept is not None and set(kept) == KEPT_NAMES and np.array_equal(kept["made_for"], made_for):
+            return _unpacked(kept["placed"]), Silhouettes.unpacked(kept, options.side**2)
+        views = template_views(self.model, renderer, options.views)
         turns = np.arange(options.turns // 4) * (2 * np.pi / options.turns)
         found = [self._place(k, view, turn) for k, view in enumerate(views) for turn in turns]
         usable = [each for each in found if each is not None]
         if not usable:
-            raise PromptError(f"{model.name} leaves no silhouette from any side: its surface is too thin to search.")
-        self.placed = [placed for placed, _, _ in usable]
-        quarters = [Silhouettes.of([mask for _, mask, _ in usable], [image for _, _, image in usable])]
-        for _ in range(3):
-            quarters.append(quarters[-1].turned())
-            self.placed += [placed.turned() for placed in self.placed[-len(usable) :]]
-        self.silhouettes = Silhouettes.joined(quarters)
-        self.aspects = np.array([placed.aspect for placed in self.placed])
+            raise PromptError(
+                f"{self.model.name} leaves no silhouette from any side: its surface is too thin to search."
+            )
+        placed = [each for each, _, _ in usable]
+        silhouettes = Silhouettes.of([mask for _, mask, _ in usable], [image for _, _, image in usable])
+        arrays = silhouettes.packed() | {"placed": _packed(placed), "made_for": made_for}
+        keep_arrays(file, arrays, most=KEPT_SILHOUETTES, compressed=False)
+        return placed, silhouettes
 
     def search(self, view: View, detection: Detection, count: int, *, moved: bool = True) -> list[Hypothesis]:
         """The best ``count`` first poses for a detection, best first, none nearer to another than ``apart``.

@@ -15,8 +15,11 @@ KINDS = {
     "openvino": "networks converted for OpenVINO",
     "openvino/compiled": "networks compiled for this processor",
     "templates-*": "views of meshes that first poses are compared with",
+    "silhouettes": "these views turned, with their outlines and colours",
+    "culled": "whether meshes look the same without the faces at their back",
     "features": "local features of meshes",
     "meshes": "large meshes as they were read",
+    "meshes-small": "other meshes as they were read",
     "light": "large meshes as they are drawn",
 }
 

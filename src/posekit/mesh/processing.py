@@ -1,20 +1,24 @@
-"""Normals, hulls, simplification and checks of vertices and faces, as arrays."""
+"""Normals, hulls, simplification and checks of vertices and faces, as arrays.
+
+SciPy takes a quarter of a second to import, and a mesh that is kept on disk does without: functions import it.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import csr_array
-from scipy.spatial import ConvexHull, KDTree
 
 from posekit.errors import MeshError
 
 _FARTHEST = 1e12  # of a vertex from the origin, in a file's own units
 _CREASE = np.cos(np.deg2rad(40.0))  # faces that meet more sharply are not smoothed together
 _STEPS = 10_000  # in which a normal's coordinates are told apart
-_PORTION = 200_000  # faces or corners that are worked on at a time, for the memory's sake
+_PORTION = 50_000  # faces or corners that are worked on at a time, for the memory's sake, and the processor's caches
 
 Floats = NDArray[np.float64]
 
@@ -30,14 +34,18 @@ def smooth_normals(vertices: Floats, faces: NDArray[np.int64]) -> tuple[NDArray[
     order = counting_order(place)
     place = place[order]
     ends = np.cumsum(np.bincount(place))  # of the corners of each place, which lie side by side
-    unit = np.empty((len(order), 3))
-    start = 0
-    while start < len(order):
-        end = int(ends[place[min(start + _PORTION, len(order)) - 1]])
+    unit, steps = np.empty((len(order), 3)), np.empty((len(order), 3), np.int16)
+    portions = [0]
+    while portions[-1] < len(order):
+        portions.append(int(ends[place[min(portions[-1] + _PORTION, len(order)) - 1]]))
+
+    def smooth(start: int, end: int) -> None:
         part = order[start:end]
-        unit[part] = _smoothed(flat[part // 3], angles.ravel()[part], ends[place[start:end]] - start)
-        start = end
-    first, inverse = _distinct(faces.ravel(), np.rint(unit * _STEPS).astype(np.int64))
+        smoothed = _smoothed(flat[part // 3], angles.ravel()[part], ends[place[start:end]] - start)
+        unit[part], steps[part] = smoothed, np.rint(smoothed * _STEPS)
+
+    _in_threads(smooth, portions)
+    first, inverse = _distinct(faces.ravel(), steps)
     return faces.ravel()[first], inverse.reshape(-1, 3), unit[first]
 
 
@@ -56,7 +64,7 @@ def _smoothed(normal: Floats, angle: Floats, ends: NDArray[np.int64]) -> Floats:
     return np.asarray(np.where(length > 1e-9, total, normal) / np.where(length > 1e-9, length, 1.0))
 
 
-def _distinct(vertex: NDArray[np.int64], normal: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _distinct(vertex: NDArray[np.int64], normal: NDArray[np.int16]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The distinct pairs of a vertex (N,) and a normal (N, 3) in units of 1 / `_STEPS`, sorted: where each is first,
     and which of them each pair is."""
     side = 2 * _STEPS + 1
@@ -78,6 +86,8 @@ def _distinct(vertex: NDArray[np.int64], normal: NDArray[np.int64]) -> tuple[NDA
 
 def counting_order(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
     """As ``np.argsort(numbers, kind="stable")`` of whole numbers from 0 on without large gaps, in linear time."""
+    from scipy.sparse import csr_array
+
     ones, rows = np.ones(len(numbers), dtype=np.int8), np.arange(len(numbers) + 1)
     return np.asarray(csr_array((ones, numbers, rows)).tocsc().indices)  # one number in each row, and rows by column
 
@@ -85,8 +95,9 @@ def counting_order(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
 def _face_normals(vertices: Floats, faces: NDArray[np.int64]) -> tuple[Floats, Floats]:
     """Unit normals (F, 3) and the angles (F, 3) at the corners."""
     normals, angles = np.empty((len(faces), 3)), np.empty((len(faces), 3))
-    for start in range(0, len(faces), _PORTION):
-        part = slice(start, start + _PORTION)
+
+    def fill(start: int, end: int) -> None:
+        part = slice(start, end)
         corners = vertices[faces[part]]
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normals[part] = normal / np.linalg.norm(normal, axis=1, keepdims=True)
@@ -94,7 +105,20 @@ def _face_normals(vertices: Floats, faces: NDArray[np.int64]) -> tuple[Floats, F
         edges /= np.maximum(np.linalg.norm(edges, axis=2, keepdims=True), 1e-300)
         cosines = -np.einsum("fij,fij->fi", edges, np.roll(edges, 1, axis=1))
         angles[part] = np.arccos(cosines.clip(-1, 1))
+
+    _in_threads(fill, [*range(0, len(faces), _PORTION), len(faces)])
     return normals, angles
+
+
+def _in_threads(work: Callable[[int, int], None], limits: Sequence[int]) -> None:
+    """Call ``work`` with each pair of neighbouring limits, two at a time: NumPy lets other threads run meanwhile."""
+    pairs = list(pairwise(limits))
+    if len(pairs) == 1:
+        work(*pairs[0])
+        return
+    with ThreadPoolExecutor(2) as pool:
+        for done in [pool.submit(work, *pair) for pair in pairs]:
+            done.result()
 
 
 def coincident(vertices: Floats) -> NDArray[np.int64]:
@@ -121,11 +145,15 @@ def mean_colors(
     fewer: NDArray[np.float32], vertices: NDArray[np.float32], colors: NDArray[np.uint8]
 ) -> NDArray[np.uint8]:
     """Of the vertices that each of fewer ones (V, 3) is nearest to; where there are none, of the nearest."""
+    from scipy.spatial import KDTree
+
     _, owner = KDTree(fewer).query(vertices, workers=-1)
     count = np.bincount(owner, minlength=len(fewer))
     sums = np.stack([np.bincount(owner, channel, minlength=len(fewer)) for channel in colors.T], axis=1)
-    _, nearest = KDTree(vertices).query(fewer)
-    means = np.where(count[:, None] > 0, sums / np.maximum(count, 1)[:, None], colors[nearest])
+    means = sums / np.maximum(count, 1)[:, None]
+    alone = np.flatnonzero(count == 0)
+    if alone.size:  # the tree of all vertices takes as long as everything else
+        means[alone] = colors[KDTree(vertices).query(fewer[alone])[1]]
     return np.asarray(np.rint(means), np.uint8)
 
 
@@ -137,6 +165,8 @@ def carried_uvs(
     corners: (F, 3, 3), corner_uvs: (F, 3, 2), the old faces'. A vertex on a seam is split. Returns the source vertex of
     each new one (V',), the new faces and the coordinates (V', 2).
     """
+    from scipy.spatial import KDTree
+
     new = vertices[faces].astype(np.float64)
     _, under = KDTree(corners.mean(axis=1)).query(new.mean(axis=1))
     origin, first, second = np.moveaxis(corners[under].astype(np.float64), 1, 0)
@@ -177,6 +207,8 @@ def subdivided(
 
 def convex_hull(points: Floats) -> Floats:
     """The corners (N, 3) of the convex hull of points (V, 3), flat ones too."""
+    from scipy.spatial import ConvexHull
+
     middle = points.mean(axis=0)
     _, spread, axes = np.linalg.svd((points - middle).T @ (points - middle))
     rank = 3 if spread[2] > 1e-12 * spread[0] else 2

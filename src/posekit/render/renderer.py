@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from posekit.camera import Camera
 from posekit.errors import RenderError
 from posekit.geometry import Pose, fibonacci_sphere, view_rotation
+from posekit.io.array_cache import keep_arrays, read_arrays
+from posekit.mesh.cache import cache_file
 from posekit.mesh.light import drawn_copy
 from posekit.mesh.model import ObjectModel
 from posekit.render import context
@@ -27,6 +29,8 @@ _TARGETS = 4  # sizes of pictures whose framebuffers are kept
 _AHEAD, _AHEAD_PIXELS = 16, 2**19  # views that are drawn before the first is read, at most so many pixels of them
 _CHECK_DIRECTIONS = fibonacci_sphere(24)
 _CHECK_SIDE, _CHECK_DISTANCE = 64, 5.0  # pixels, of the pictures in which culling is tried, and bounding radii
+_KEPT_CHECK_FACES = 10_000  # from which its answer is kept on disk: it takes a tenth of a second for 40,000 faces
+_KEPT_CHECK_VERSION = 1
 
 
 class Renderer:
@@ -129,8 +133,21 @@ class Renderer:
         mesh = self._meshes.get(model)
         if mesh is None:
             mesh = self._meshes[model] = Mesh(gl, model)
-            mesh.culled = mesh.front is not None and self._looks_alike_culled(gl, mesh)
+            mesh.culled = mesh.front is not None and self._may_be_culled(gl, mesh, model)
         return mesh
+
+    def _may_be_culled(self, gl: moderngl.Context, mesh: Mesh, model: ObjectModel) -> bool:
+        """`_looks_alike_culled`; of a mesh with many faces kept on disk, for this OpenGL."""
+        if len(model.faces) < _KEPT_CHECK_FACES:
+            return self._looks_alike_culled(gl, mesh)
+        file = cache_file("culled", model, _KEPT_CHECK_VERSION)
+        drawn_by = np.array(f"{gl.info['GL_RENDERER']} {gl.info['GL_VERSION']}")
+        kept = read_arrays(file)
+        if kept is not None and set(kept) == {"culled", "drawn_by"} and kept["drawn_by"] == drawn_by:
+            return bool(kept["culled"])
+        culled = self._looks_alike_culled(gl, mesh)
+        keep_arrays(file, {"culled": np.array(culled), "drawn_by": drawn_by})
+        return culled
 
     def _looks_alike_culled(self, gl: moderngl.Context, mesh: Mesh) -> bool:
         """Whether no face that turns its back is seen from outside: tried from all sides. A single pixel may differ:
