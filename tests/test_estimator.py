@@ -178,7 +178,7 @@ def test_a_frame_in_doubt_has_not_converged() -> None:
         assert found.estimate is not None and found.estimate.angle == 0.2 and not found.estimate.converged
 
 
-# --- a quick look at many proposals ------------------------------------------------------------------------------------
+# --- a quick look at many proposals ----------------------------------------------------------------------------------
 
 
 def test_of_many_proposals_the_network_compares_those_that_similarity_and_evidence_speak_for(
@@ -200,5 +200,5 @@ def test_of_many_proposals_the_network_compares_those_that_similarity_and_eviden
     scores = screened(0.5, 0.5, 0.5, 0.1, 0.5)
     assert np.isfinite(scores).sum() == 3 and np.isfinite(scores[4]) and scores[3] == -np.inf
     assert np.argmax(scores) == 4
-    assert screened(0.5, 0.5, 0.5, 0.1, 0.0)[4] == -np.inf, "too unlike the mesh"
+    assert screened(0.9, 0.9, 0.9, 0.1, 0.0)[4] == -np.inf, "too unlike the mesh"
     assert estimator.screen(view, []) == []

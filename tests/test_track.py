@@ -633,3 +633,21 @@ def test_what_was_found_too_long_ago_is_dropped(model: ObjectModel, renderer: Re
     for wrong in ({"search_share": 0}, {"search_age": 0}):
         with pytest.raises(ConfigError):
             TrackConfig(**wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("colours", ["own", "none", "grey"])
+def test_the_network_sees_the_mesh_as_the_video_shows_it(renderer: Renderer, colours: str) -> None:
+    coloured = parcel()
+    assert coloured.colors is not None
+    given = {"own": coloured.colors, "none": None, "grey": np.full_like(coloured.colors, 200)}[colours]
+    model = replace(coloured, colors=given)
+    for learning in (True, False):
+        config = replace(STEADY, appearance=learning)
+        following = tracker(model, renderer, path(model, 0), config, pose=path(model, 0))
+        for k in range(2):
+            following.predictor.truth = path(model, k)  # type: ignore[attr-defined]
+            assert following.step(photograph(renderer, coloured, path(model, k)).image).state == TRACKED
+        assert following._before is not None
+        drawn, seen = following._before.drawn, following._before.seen
+        off = np.abs(drawn.image[drawn.mask].astype(int) - seen.image[drawn.mask]).mean()
+        assert (off < 25) == (learning or colours == "own"), off

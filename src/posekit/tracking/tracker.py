@@ -31,6 +31,7 @@ from posekit.nets.pose_delta import apply_delta
 from posekit.nets.precision import usable_cores
 from posekit.nets.predictor import PairPrediction, Predictor
 from posekit.results import Branch, Detection, Estimate, Source
+from posekit.tracking.appearance import Appearance, colours_agree
 from posekit.tracking.memory import Memory, distinct
 from posekit.tracking.points import Keyframe, follow_points, match_texture
 from posekit.view import View
@@ -53,7 +54,8 @@ BIASED, MOST_BIASED, BIAS_RATE = 1.0, 2.0, 0.2
 ANGLE_OF_DOUBLE = math.radians(4.0)  # predicted angle at which that number doubles
 TINT_RATE = 0.15  # weight of a frame in the running tint
 # contrast of a silhouette, to the usual one, below which turned poses are tried too; by how much they are turned
-LESS_SEPARATED, TURNED = 0.88, math.radians(25.0)
+# contrast by which a turned pose has to be better: part of an object that is being hidden lowers it, too
+LESS_SEPARATED, TURNED, TURNED_MARGIN = 0.88, math.radians(25.0), 0.1
 COARSE = 1500  # of the mesh that is drawn where the outline is looked for in smaller crops
 FACES = 6000  # of the mesh that is drawn: a crop shows no more
 LEAST_SCALE, KNEE = 0.5, 2.5  # pixels, no correspondence is more exact; standard deviations
@@ -124,6 +126,8 @@ class TrackConfig:
     search_beside: bool = False
     search_share: float = 0.5
     search_age: float = 10.0
+    # whether a mesh without colours, or with others than the first frame shows, is compared as the video has shown it
+    appearance: bool = True
     remember: bool = True  # whether views of the followed object are kept, and a lost one is looked for by them
     runtime: str = "openvino"  # of the network
 
@@ -224,6 +228,7 @@ class Tracker:
         self._bias = 0.0  # pixels of the crop: how far the network alone has been from what all evidence gave
         self._waiting = 0  # frames until the next search
         self._memory = Memory(model, self.renderer)
+        self._appearance: Appearance | None = None  # in place of the mesh's colours, where these are wrong
         self._known: _Known | None = None
         self._place: Pose | None = None  # ``T_cam_obj``, where a search's frame has the object's colours
         self._searching: Future[Tracked] | None = None  # of a search beside the loop
@@ -281,8 +286,15 @@ class Tracker:
         if (visible & drawn.mask).sum() < 0.15 * drawn.mask.sum():
             visible = np.ones_like(visible)
         self._colours = learn(seen, drawn.mask, visible)
-        self._tint = Tint.of(off_colour(seen, drawn), visible & drawn.mask)
-        self._before = Keyframe(seen, drawn, Pose.rotation(seen.R_view_cam) @ centred, visible)
+        T_view_ctr = Pose.rotation(seen.R_view_cam) @ centred
+        if self._appearance is None and self._to_be_learned(seen, drawn, visible):
+            self._appearance = Appearance(self.model.center, self.model.diameter)
+            self._appearance.keep(seen, drawn, T_view_ctr, visible)
+        drawn, known = self._painted(drawn, T_view_ctr)
+        assert drawn.mask is not None
+        there = visible & drawn.mask
+        self._tint = Tint.of(off_colour(seen, drawn), there if known is None else there & known)
+        self._before = Keyframe(seen, drawn, T_view_ctr, visible)
         self._separated = self._separated_first = contrast(seen, drawn.mask, self._colours)
         self._separated_usual = self._separated
         self._grown = {scale: self._growth(view, pose, scale) for scale in {1, *self.config.scales}}
@@ -322,13 +334,18 @@ class Tracker:
             if not self._in_front(pose):
                 return None
             seen, drawn = self._crops(view, pose)
+            T_view_ctr = Pose.rotation(seen.R_view_cam) @ state.pose
+            drawn, known = self._painted(drawn, T_view_ctr)
             assert drawn.mask is not None
             apart = off_colour(seen, drawn)
-            visible = colours.seen(seen) & ~tint.hides(apart, drawn.mask)
+            if known is not None:
+                apart = np.where(known[..., None], apart, tint.apart)
+            other = tint.hides(apart, drawn.mask)
+            visible = colours.seen(seen) & ~other
             answer = self._executor.submit(self._compared, seen, drawn, visible)
             # while the network computes
-            keyframe = Keyframe(seen, drawn, Pose.rotation(seen.R_view_cam) @ state.pose, visible)
-            more = self._lines(keyframe, seen, visible, colours) + self._texture(keyframe)
+            keyframe = Keyframe(seen, drawn, T_view_ctr, visible)
+            more = self._lines(keyframe, seen, visible, colours) + self._texture(keyframe, known)
             new_colours = colours.mixed(learn(seen, drawn.mask, visible), self.config.learn)
             new_tint = tint.mixed(Tint.of(apart, visible & drawn.mask), TINT_RATE)
             keyframe.prepare()
@@ -351,6 +368,8 @@ class Tracker:
         share = float((visible & shown).sum() / max(1, shown.sum()))
         self._motion = Pose(state.pose.R @ last.R.T, state.pose.t - last.t)
         self._state, self._before = state, keyframe
+        if self._appearance is not None:
+            self._appearance.compare(other, visible & drawn.mask & seen.shown)
         self._separated = contrast(seen, drawn.mask, colours)
         self._contradictions = self._contradicting(keyframe, prediction, more, there)
         if (
@@ -436,7 +455,8 @@ class Tracker:
                 start = replace(predicted, pose=Pose(so3_exp(TURNED * axis) @ best.R, best.t))
                 candidates.append(self._aligned(view, start, colours, coarse))
                 qualities.append(self._separation(view, candidates[-1].pose, colours))
-        best_of = int(np.argmax(np.array(qualities) - [0.0, *[self.config.margin] * (len(candidates) - 1)]))
+        margins = [0.0, *[self.config.margin] * len(aligned), *[TURNED_MARGIN] * (len(candidates) - 1 - len(aligned))]
+        best_of = int(np.argmax(np.array(qualities) - margins))
         return self._aligned(view, candidates[best_of], colours, [fine])
 
     def _separation(self, view: View, T_cam_ctr: Pose, colours: Colours) -> float:
@@ -496,9 +516,27 @@ class Tracker:
         found = follow_points(before, start, seen, self.model) if self.config.motion == "points" else None
         return [] if found is None else [found]
 
-    def _texture(self, keyframe: Keyframe) -> list[Residual]:
-        coloured = self.model.colors is not None or self.model.texture is not None
-        found = match_texture(keyframe, self.model) if self.config.texture and coloured else None
+    def _to_be_learned(self, seen: View, drawn: View, visible: NDArray[np.bool_]) -> bool:
+        """Whether a first frame does not have the mesh's colours."""
+        return self.config.appearance and not (self._coloured and colours_agree(seen, drawn, visible))
+
+    @property
+    def _coloured(self) -> bool:
+        return self.model.colors is not None or self.model.texture is not None
+
+    def _painted(self, drawn: View, T_view_ctr: Pose) -> tuple[View, NDArray[np.bool_] | None]:
+        """The mesh as the video has shown it, and where (H, W) it has; as it was drawn, and None, where the mesh's own
+        colours are right."""
+        if self._appearance is None:
+            return drawn, None
+        image, known = self._appearance.painted(drawn, T_view_ctr)
+        return replace(drawn, image=image), known
+
+    def _texture(self, keyframe: Keyframe, known: NDArray[np.bool_] | None) -> list[Residual]:
+        """known: (H, W), where the drawing has the object's colours; None: everywhere."""
+        if not self.config.texture or not (self._coloured or self._appearance is not None):
+            return []
+        found = match_texture(keyframe, self.model, known)
         return [] if found is None else [found]
 
     def _lines(self, keyframe: Keyframe, seen: View, visible: NDArray[np.bool_], colours: Colours) -> list[Residual]:
@@ -608,6 +646,10 @@ class Tracker:
         T_view_ctr = Pose.rotation(before.seen.R_view_cam) @ state.pose
         if self.config.remember and sure and self._memory.wants(T_view_ctr):
             self._memory.keep(view, before, T_view_ctr)
+        if sure and self._appearance is not None and self._appearance.wants(T_view_ctr):
+            pose, camera = T_view_ctr @ self.model.T_ctr_obj, before.seen.camera
+            [drawn] = self.renderer.render(self._drawn, [pose], camera, rgb=False, coords=True)
+            self._appearance.keep(before.seen, drawn, T_view_ctr, before.visible)
 
     def _better(self, view: View) -> Estimate | None:
         """What memory finds when a pose has been contradicted for some frames; where it finds nothing that is borne
