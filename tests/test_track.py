@@ -33,6 +33,7 @@ from posekit.metrics import pose_error
 from posekit.render import Renderer
 from posekit.results import Detection, Estimate
 from posekit.synth.example import Example, ply
+from posekit.tracking.appearance import SETTLED
 from posekit.tracking.memory import MOST, Memory
 from posekit.tracking.points import Keyframe, follow_points, match_texture
 from posekit.tracking.tracker import LOST, TRACKED, UNCERTAIN, TrackConfig, Tracker
@@ -636,18 +637,22 @@ def test_what_was_found_too_long_ago_is_dropped(model: ObjectModel, renderer: Re
 
 
 @pytest.mark.parametrize("colours", ["own", "none", "grey"])
-def test_the_network_sees_the_mesh_as_the_video_shows_it(renderer: Renderer, colours: str) -> None:
+def test_what_is_in_front_is_told_by_the_colours_that_the_video_shows(renderer: Renderer, colours: str) -> None:
     coloured = parcel()
     assert coloured.colors is not None
     given = {"own": coloured.colors, "none": None, "grey": np.full_like(coloured.colors, 200)}[colours]
-    model = replace(coloured, colors=given)
-    for learning in (True, False):
-        config = replace(STEADY, appearance=learning)
-        following = tracker(model, renderer, path(model, 0), config, pose=path(model, 0))
-        for k in range(2):
-            following.predictor.truth = path(model, k)  # type: ignore[attr-defined]
-            assert following.step(photograph(renderer, coloured, path(model, k)).image).state == TRACKED
-        assert following._before is not None
-        drawn, seen = following._before.drawn, following._before.seen
-        off = np.abs(drawn.image[drawn.mask].astype(int) - seen.image[drawn.mask]).mean()
-        assert (off < 25) == (learning or colours == "own"), off
+    model, still = replace(coloured, colors=given), path(coloured, 0)
+    following = tracker(model, renderer, still, STEADY, pose=still)
+    photo = photograph(renderer, coloured, still)
+    for _ in range(SETTLED + 2):
+        assert following.step(photo.image).state == TRACKED
+    assert (following._appearance is None) == (colours == "own")
+    columns = np.nonzero(renderer.render(coloured, [still], photo.camera, coords=False)[0].mask)[1]
+    image = photo.image.copy()
+    image[:, int(np.quantile(columns, 0.7)) : columns.max() + 1] = (30, 200, 60)
+    following.step(image)
+    before = following._before
+    assert before is not None and before.drawn.mask is not None
+    green = (before.seen.image.astype(int) - (30, 200, 60) == 0).all(2) & before.drawn.mask
+    assert green.mean() > 0.01 and before.visible[green].mean() < 0.3
+    assert before.visible[before.drawn.mask & ~green].mean() > 0.7

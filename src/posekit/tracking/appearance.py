@@ -1,7 +1,9 @@
 """How an object looks in the video, learned while it is followed.
 
 A mesh may have no colours, or other ones than the object in the video. Frames whose poses the evidence bears out show
-what it looks like: they are projected onto the mesh, which is then drawn as the video showed it.
+what it looks like: they are projected onto the mesh, which is then drawn as the video showed it. So what is in front of
+the object is told by its colours. (The network compares the mesh as it is: with what earlier frames showed, it repeats
+the errors of their poses.)
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from posekit.view import View
 
 Mask = NDArray[np.bool_]
 
+SETTLED = 4  # frames before the first is kept: by then outlines have corrected a first pose that is some degrees wrong
 MOST = 16  # frames that are kept
 USED = 2  # of them, those whose directions are nearest, for one drawing
 APART = math.radians(12.0)  # between the directions of two kept frames
@@ -59,12 +62,16 @@ class Appearance:
     def __init__(self, center: NDArray[np.float64], diameter: float) -> None:
         self.center, self.diameter = center, diameter
         self.looks: list[Look] = []
+        self._frames = 0  # that were compared
         self._known = 1.0  # share of what the last compared frame shows of the object that was painted
         # of the last drawing: kept frames, their pixels (N, 2), and the pixels (N,), (N,) painted with them
         self._painted: list[tuple[Look, NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]] = []
 
     def wants(self, T_view_ctr: Pose) -> bool:
-        """Whether no kept frame shows this side, or too little of what the last compared frame showed of it."""
+        """Whether no kept frame shows this side, or too little of what the last compared frame showed of it; not in the
+        first frames."""
+        if self._frames < SETTLED:
+            return False
         direction = towards_camera(T_view_ctr)
         apart = all(float(direction @ look.direction) < math.cos(APART) for look in self.looks)
         return apart or (self._known < LEAST_KNOWN and len(self.looks) < MOST)
@@ -81,7 +88,7 @@ class Appearance:
         direction = towards_camera(T_view_ctr)
         missed = np.zeros(shown.shape, np.uint8)
         self.looks.append(Look(seen.image, seen.camera, T_view_ctr, points, direction, missed))
-        if len(self.looks) > MOST:  # one of the two that are most alike; the first one's pose is the surest
+        if len(self.looks) > MOST:  # one of the two that are most alike; the first one has drifted least
             directions = np.stack([look.direction for look in self.looks])
             alike = directions @ directions.T - 2 * np.eye(len(directions))
             del self.looks[1 + int(np.argmax(alike[1:].max(axis=1)))]
@@ -111,6 +118,7 @@ class Appearance:
         (H, W), where it shows the object.
 
         What hid the object in a kept frame is forgotten when the object is seen there for `MISSED` frames."""
+        self._frames += 1
         inner, known = _inside(shown), 0
         for look, pixels, rows, columns in self._painted:
             known += int(inner[rows, columns].sum())
@@ -118,7 +126,8 @@ class Appearance:
             look.missed[at] = np.where(other[rows, columns], np.minimum(look.missed[at] + 1, MISSED), 0)
             gone = look.missed[at] >= MISSED
             look.points[pixels[gone, 1], pixels[gone, 0]] = np.nan
-        self._known = known / max(1, int(inner.sum()))
+        if inner.any():
+            self._known = known / int(inner.sum())
 
     def _shown(self, look: Look, points: NDArray[np.float32]) -> tuple[NDArray[np.float32], Mask]:
         """Pixels (N, 2) of a kept frame at which points (N, 3) of ``ctr`` lie, and which of them it shows."""

@@ -102,18 +102,15 @@ def follow_points(before: Keyframe, pose: Pose, after: View, model: ObjectModel)
     return Points(points, targets, np.ones(len(points)), np.full(len(points), SIGMA), correlated=CORRELATED)
 
 
-def match_texture(keyframe: Keyframe, model: ObjectModel, known: NDArray[np.bool_] | None = None) -> Points | None:
+def match_texture(keyframe: Keyframe, model: ObjectModel) -> Points | None:
     """Points of the mesh, as drawn, and where the frame shows the same texture; None where too few are similar.
 
-    known: (H, W), where the drawing has the object's colours; None: everywhere.
     Both pictures are compared by their local contrast, since the light differs.
     """
     drawn, camera = keyframe.drawn, keyframe.drawn.camera
     assert drawn.mask is not None and drawn.coords is not None
     first, second = (_contrast(v.image) for v in (drawn, keyframe.seen))
     solid = drawn.mask & keyframe.visible & keyframe.seen.shown
-    if known is not None:
-        solid &= known
     inside = cv2.erode(solid.astype(np.uint8), np.ones((7, 7), np.uint8))
     corners = cv2.goodFeaturesToTrack(first, CORNERS, TEXTURE_QUALITY, LEAST_DISTANCE, mask=inside)
     if corners is None or len(corners) < LEAST:

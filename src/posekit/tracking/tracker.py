@@ -126,7 +126,8 @@ class TrackConfig:
     search_beside: bool = False
     search_share: float = 0.5
     search_age: float = 10.0
-    # whether a mesh without colours, or with others than the first frame shows, is compared as the video has shown it
+    # whether what hides an object is told by the colours that the video has shown of it, where the mesh has none, or
+    # others than the first frame shows
     appearance: bool = True
     remember: bool = True  # whether views of the followed object are kept, and a lost one is looked for by them
     runtime: str = "openvino"  # of the network
@@ -228,7 +229,7 @@ class Tracker:
         self._bias = 0.0  # pixels of the crop: how far the network alone has been from what all evidence gave
         self._waiting = 0  # frames until the next search
         self._memory = Memory(model, self.renderer)
-        self._appearance: Appearance | None = None  # in place of the mesh's colours, where these are wrong
+        self._appearance: Appearance | None = None  # where the mesh's colours are wrong
         self._known: _Known | None = None
         self._place: Pose | None = None  # ``T_cam_obj``, where a search's frame has the object's colours
         self._searching: Future[Tracked] | None = None  # of a search beside the loop
@@ -289,11 +290,8 @@ class Tracker:
         T_view_ctr = Pose.rotation(seen.R_view_cam) @ centred
         if self._appearance is None and self._to_be_learned(seen, drawn, visible):
             self._appearance = Appearance(self.model.center, self.model.diameter)
-            self._appearance.keep(seen, drawn, T_view_ctr, visible)
-        drawn, known = self._painted(drawn, T_view_ctr)
-        assert drawn.mask is not None
-        there = visible & drawn.mask
-        self._tint = Tint.of(off_colour(seen, drawn), there if known is None else there & known)
+        apart, known = self._off_colour(seen, drawn, T_view_ctr)
+        self._tint = Tint.of(apart, visible & drawn.mask & known)
         self._before = Keyframe(seen, drawn, T_view_ctr, visible)
         self._separated = self._separated_first = contrast(seen, drawn.mask, self._colours)
         self._separated_usual = self._separated
@@ -335,17 +333,15 @@ class Tracker:
                 return None
             seen, drawn = self._crops(view, pose)
             T_view_ctr = Pose.rotation(seen.R_view_cam) @ state.pose
-            drawn, known = self._painted(drawn, T_view_ctr)
             assert drawn.mask is not None
-            apart = off_colour(seen, drawn)
-            if known is not None:
-                apart = np.where(known[..., None], apart, tint.apart)
+            apart, known = self._off_colour(seen, drawn, T_view_ctr)
+            apart = np.where(known[..., None], apart, tint.apart)
             other = tint.hides(apart, drawn.mask)
             visible = colours.seen(seen) & ~other
             answer = self._executor.submit(self._compared, seen, drawn, visible)
             # while the network computes
             keyframe = Keyframe(seen, drawn, T_view_ctr, visible)
-            more = self._lines(keyframe, seen, visible, colours) + self._texture(keyframe, known)
+            more = self._lines(keyframe, seen, visible, colours) + self._texture(keyframe)
             new_colours = colours.mixed(learn(seen, drawn.mask, visible), self.config.learn)
             new_tint = tint.mixed(Tint.of(apart, visible & drawn.mask), TINT_RATE)
             keyframe.prepare()
@@ -524,19 +520,16 @@ class Tracker:
     def _coloured(self) -> bool:
         return self.model.colors is not None or self.model.texture is not None
 
-    def _painted(self, drawn: View, T_view_ctr: Pose) -> tuple[View, NDArray[np.bool_] | None]:
-        """The mesh as the video has shown it, and where (H, W) it has; as it was drawn, and None, where the mesh's own
-        colours are right."""
+    def _off_colour(self, seen: View, drawn: View, T_view_ctr: Pose) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """`off_colour` of a crop, and where (H, W) the object's colours are known: everywhere by the mesh; where the
+        mesh's colours are wrong, where the video has shown them."""
         if self._appearance is None:
-            return drawn, None
+            return off_colour(seen, drawn), np.ones(seen.image.shape[:2], np.bool_)
         image, known = self._appearance.painted(drawn, T_view_ctr)
-        return replace(drawn, image=image), known
+        return off_colour(seen, replace(drawn, image=image)), known
 
-    def _texture(self, keyframe: Keyframe, known: NDArray[np.bool_] | None) -> list[Residual]:
-        """known: (H, W), where the drawing has the object's colours; None: everywhere."""
-        if not self.config.texture or not (self._coloured or self._appearance is not None):
-            return []
-        found = match_texture(keyframe, self.model, known)
+    def _texture(self, keyframe: Keyframe) -> list[Residual]:
+        found = match_texture(keyframe, self.model) if self.config.texture and self._coloured else None
         return [] if found is None else [found]
 
     def _lines(self, keyframe: Keyframe, seen: View, visible: NDArray[np.bool_], colours: Colours) -> list[Residual]:
