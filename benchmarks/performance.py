@@ -29,7 +29,9 @@ from scipy.spatial import cKDTree
 from posekit import metrics
 from posekit.camera import Camera
 from posekit.datasets.bop import BopDataset
-from posekit.estimate.estimator import EstimateOptions, PoseEstimator
+from posekit.detect.novel import make_detector
+from posekit.estimate.estimator import EstimateOptions, Estimators, PoseEstimator
+from posekit.estimate.instances import find_instances
 from posekit.estimate.refine import RefineOptions, compare, refine
 from posekit.geometry import Pose, PoseNoise, random_rotation
 from posekit.mesh.model import ObjectModel
@@ -39,6 +41,7 @@ from posekit.results import Detection
 from posekit.view import View
 
 VIEWS = 200  # that are drawn
+SEARCHED = 7  # pictures that are searched without a box
 # A process between, since what one takes counts for those that it starts.
 MEASURED = """
 import resource, subprocess, sys, time
@@ -200,6 +203,36 @@ def estimating(frames: Frames) -> str:
     return text + table(["", "median, s", "largest, s", "memory, GB"], rows)
 
 
+def searching(frames: Frames) -> str:
+    """Without a box: detecting and estimating, for the object that a picture shows, and for six of which it shows one;
+    after a picture that does not count."""
+    chosen = sorted({int(k) for k in np.linspace(0, len(frames.keys) - 1, SEARCHED)})
+    models = {model.name: model for _, model, _, _ in map(frames.get, range(len(frames.keys)))}
+    detector, _ = make_detector(None, list(models.values()), doubtful=True)
+    estimators, rows = Estimators(), []
+
+    def search(view: View, wanted: list[ObjectModel]) -> list[float]:
+        started = time.perf_counter()
+        detections = detector.detect(view, wanted)
+        detected = time.perf_counter()
+        find_instances(estimators, view, wanted, detections)
+        return [detected - started, time.perf_counter() - started]
+
+    for count in (1, 6):
+        seconds = []
+        for k in chosen:
+            view, model, _, _ = frames.get(k)
+            others = [other for name, other in models.items() if name != model.name]
+            wanted = [models[model.name], *others[: count - 1]]
+            if not seconds or count == 1:
+                search(view, wanted)  # what is made once per mesh
+            seconds.append(search(View(view.image, view.camera), wanted))
+        detecting, whole = np.median(seconds, axis=0)
+        rows.append([str(len(wanted)), f"{detecting:.1f}", f"{whole:.1f}", f"{max(total for _, total in seconds):.1f}"])
+    head = ["meshes", "detection, median, s", "all, median, s", "all, largest, s"]
+    return f"Warm, {len(chosen)} pictures.\n\n" + table(head, rows)
+
+
 def beside(frames: Frames, repeats: int) -> str:
     """Estimating alone and beside two processes that never wait, in turn, all at the same niceness."""
     view, model, detection, _ = frames.get(0)
@@ -338,6 +371,7 @@ def main() -> None:
         "Rendering": lambda: rendering(frames, args.repeats, args.pyrender),
         "One refine iteration": lambda: iteration(frames, args.repeats),
         "Estimating from a box": lambda: estimating(frames),
+        "Estimating without a box": lambda: searching(frames),
         "Beside busy processes": lambda: beside(frames, args.repeats),
         "Scoring": lambda: scoring(frames, args.poses),
         "Growth": lambda: growth(frames, args.repeats, args.quick),

@@ -29,6 +29,7 @@ LEAST = 6  # points
 SIGMA, CORRELATED = 0.5, 3.0
 # the same where the mesh's drawing is matched with the frame; and how far off a match may be, pixels
 TEXTURE_QUALITY, TEXTURE_SIGMA, TEXTURE_CORRELATED, FARTHEST = 0.02, 1.0, 0.7, 5.0
+TEXTURE_LEVELS = 1  # of the pyramid for that: in a coarser one a small object's surroundings, which differ, take part
 CORRELATION_RANGE = (0.5, 0.8)  # correlations of patches from which on a match counts, and counts wholly
 PATCH, CONTRAST_SIGMA, LEAST_CONTRAST = 9, 4.0, 4.0  # pixels; pixels; grey values below which contrast is noise
 
@@ -115,7 +116,7 @@ def match_texture(keyframe: Keyframe, model: ObjectModel) -> Points | None:
     corners = cv2.goodFeaturesToTrack(first, CORNERS, TEXTURE_QUALITY, LEAST_DISTANCE, mask=inside)
     if corners is None or len(corners) < LEAST:
         return None
-    places, steady = _followed(first, second, corners)
+    places, steady = _followed(first, second, corners, TEXTURE_LEVELS)
     corners = corners[:, 0]
     steady &= np.linalg.norm(places - corners, axis=1) < FARTHEST
     if steady.sum() < LEAST:
@@ -158,10 +159,10 @@ def _patches(picture: NDArray[np.uint8], centres: NDArray[np.float32]) -> NDArra
 
 
 def _followed(
-    first: NDArray[np.uint8], second: NDArray[np.uint8], corners: NDArray[np.float32]
+    first: NDArray[np.uint8], second: NDArray[np.uint8], corners: NDArray[np.float32], levels: int = LEVELS
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Places (N, 2) in the second picture, and which of them lead back to where they came from."""
-    there, ahead, _ = cv2.calcOpticalFlowPyrLK(first, second, corners, None, winSize=WINDOW, maxLevel=LEVELS)
-    back, behind, _ = cv2.calcOpticalFlowPyrLK(second, first, there, None, winSize=WINDOW, maxLevel=LEVELS)
+    there, ahead, _ = cv2.calcOpticalFlowPyrLK(first, second, corners, None, winSize=WINDOW, maxLevel=levels)
+    back, behind, _ = cv2.calcOpticalFlowPyrLK(second, first, there, None, winSize=WINDOW, maxLevel=levels)
     away = np.linalg.norm((back - corners)[:, 0], axis=1)
     return there[:, 0], (ahead.ravel() > 0) & (behind.ravel() > 0) & (away < MOST_RETURN_ERROR)
