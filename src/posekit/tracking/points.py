@@ -106,12 +106,15 @@ def follow_points(before: Keyframe, pose: Pose, after: View, model: ObjectModel)
 def match_texture(keyframe: Keyframe, model: ObjectModel) -> Points | None:
     """Points of the mesh, as drawn, and where the frame shows the same texture; None where too few are similar.
 
-    Both pictures are compared by their local contrast, since the light differs.
+    Both pictures are compared by their local contrast on the object, since the light and the surroundings differ.
     """
     drawn, camera = keyframe.drawn, keyframe.drawn.camera
     assert drawn.mask is not None and drawn.coords is not None
-    first, second = (_contrast(v.image) for v in (drawn, keyframe.seen))
     solid = drawn.mask & keyframe.visible & keyframe.seen.shown
+    first, second = (
+        _contrast(drawn.image, drawn.mask, drawn.mask),
+        _contrast(keyframe.seen.image, solid, cv2.dilate(solid.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0),
+    )
     inside = cv2.erode(solid.astype(np.uint8), np.ones((7, 7), np.uint8))
     corners = cv2.goodFeaturesToTrack(first, CORNERS, TEXTURE_QUALITY, LEAST_DISTANCE, mask=inside)
     if corners is None or len(corners) < LEAST:
@@ -132,12 +135,14 @@ def match_texture(keyframe: Keyframe, model: ObjectModel) -> Points | None:
     return Points(points, targets, weight, np.full(len(points), TEXTURE_SIGMA), correlated=TEXTURE_CORRELATED)
 
 
-def _contrast(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Grey values (H, W) less their surroundings' mean, over the surroundings' spread."""
+def _contrast(image: NDArray[np.uint8], mask: NDArray[np.bool_], kept: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Grey values (H, W) less the mean of what the mask shows round them, over its spread; 128 where not kept."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    centred = grey - cv2.GaussianBlur(grey, (0, 0), CONTRAST_SIGMA)
-    spread = np.sqrt(cv2.GaussianBlur(centred * centred, (0, 0), CONTRAST_SIGMA)) + LEAST_CONTRAST
-    return np.asarray(np.clip(128 + 40 * centred / spread, 0, 255), np.uint8)
+    weight = mask.astype(np.float32) + np.float32(1e-3)
+    share = cv2.GaussianBlur(weight, (0, 0), CONTRAST_SIGMA)
+    centred = grey - cv2.GaussianBlur(grey * weight, (0, 0), CONTRAST_SIGMA) / share
+    spread = np.sqrt(cv2.GaussianBlur(centred * centred * weight, (0, 0), CONTRAST_SIGMA) / share) + LEAST_CONTRAST
+    return np.where(kept, np.clip(128 + 40 * centred / spread, 0, 255), 128).astype(np.uint8)
 
 
 def _correlation(
