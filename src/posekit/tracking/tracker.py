@@ -55,7 +55,7 @@ ANGLE_OF_DOUBLE = math.radians(4.0)  # predicted angle at which that number doub
 TINT_RATE = 0.15  # weight of a frame in the running tint
 # contrast of a silhouette, to the usual one, below which turned poses are tried too; by how much they are turned
 # contrast by which a turned pose has to be better: part of an object that is being hidden lowers it, too
-LESS_SEPARATED, TURNED, TURNED_MARGIN = 0.88, math.radians(25.0), 0.1
+LESS_SEPARATED, TURNED, TURNED_MARGIN = 0.88, math.radians(25.0), 0.05
 COARSE = 1500  # of the mesh that is drawn where the outline is looked for in smaller crops
 FACES = 6000  # of the mesh that is drawn: a crop shows no more
 LEAST_SCALE, KNEE = 0.5, 2.5  # pixels, no correspondence is more exact; standard deviations
