@@ -75,14 +75,6 @@ def test_a_damaged_kept_mesh_is_read_anew(sphere: Path) -> None:
     np.testing.assert_array_equal(ObjectModel.load(sphere).vertices, first.vertices)
 
 
-def test_whether_a_light_copy_is_there(sphere: Path) -> None:
-    model = ObjectModel.load(sphere)
-    assert not light.has_light_copy(model)
-    copy = light.light_copy(model)
-    for each in (model, copy, ObjectModel.load(sphere)):
-        assert light.has_light_copy(each)
-
-
 def test_normals_do_not_depend_on_portions(sphere: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     mesh = ObjectModel.load(sphere)
     arguments = mesh.vertices.astype(np.float64), mesh.faces.astype(np.int64)

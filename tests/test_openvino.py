@@ -7,7 +7,6 @@ import json
 import os
 import subprocess
 import sys
-import threading
 import weakref
 from pathlib import Path
 
@@ -92,49 +91,6 @@ def test_a_missing_openvino_is_said(monkeypatch: pytest.MonkeyPatch, caplog: pyt
     monkeypatch.setitem(sys.modules, "openvino", None)
     assert Runtime().runtime == "torch"
     assert "OpenVINO cannot be used" in caplog.text
-
-
-def test_a_started_predictor_is_the_predictor(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is loaded in another thread, once, and what goes wrong there is raised where it is used."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(kept))
-    runtime, load, threads = Runtime(runtime="openvino"), Runtime.predictor_for, []
-    monkeypatch.setattr(
-        Runtime, "predictor_for", lambda *args: threads.append(threading.current_thread()) or load(*args)
-    )
-    runtime.start()
-    runtime.start()
-    assert runtime.predictor is runtime.predictor
-    runtime.start()
-    assert len(threads) == 1
-    assert threads[0] is not threading.main_thread()
-
-    def fails(*args: object) -> None:
-        raise RuntimeError("no such processor")
-
-    monkeypatch.setattr(Runtime, "predictor_for", fails)
-    broken = Runtime(runtime="openvino")
-    broken.start()
-    with pytest.raises(RuntimeError, match="no such processor"):
-        _ = broken.predictor
-
-
-def test_an_unconverted_network_is_not_started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(Runtime, "predictor_for", lambda *args: pytest.fail("it was loaded"))
-    Runtime(runtime="openvino").start()
-
-
-def test_an_estimate_needs_no_torch(kept: Path) -> None:
-    """Where the converted network is kept, a pose from a box is found without importing PyTorch, which takes long."""
-    code = (
-        "import sys, numpy as np; from posekit.synth.example import make_example; from posekit.api import estimate\n"
-        "from posekit.render import Renderer\n"
-        "e = make_example(Renderer()); r = estimate(e.view, e.model, e.box)\n"
-        "assert 'torch' not in sys.modules, 'torch was imported'; print(r.best.iterations)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False,
-                          env={**os.environ, "XDG_CACHE_HOME": str(kept)})  # fmt: skip
-    assert done.returncode == 0, done.stderr
 
 
 def test_the_command_imports_no_more_than_it_needs(kept: Path, example_folder: Path, tmp_path: Path) -> None:

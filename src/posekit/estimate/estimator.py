@@ -27,7 +27,6 @@ from posekit.first_pose.hypotheses import (
     perturbed_poses,
 )
 from posekit.geometry import Pose, rotation_angle
-from posekit.mesh.light import has_light_copy
 from posekit.mesh.model import ObjectModel
 from posekit.nets.predictor import PairPrediction, Predictor
 from posekit.nets.runtime import Runtime
@@ -117,8 +116,6 @@ class PoseEstimator:
             networks = Runtime(preset, weights, device=device, runtime=runtime, networks=networks)
         self.runtime = networks
         self.refine_options = options.refine_options(networks.dense)
-        if has_light_copy(model):  # else the memory for making it and for the network would add up
-            networks.start()
         self.renderer = Renderer()
         self._search: FirstPoseSearch | None = None  # in place of the search by boxes
         self._features = FeatureSearch(model, self.renderer)

@@ -30,11 +30,6 @@ def light_copy(model: ObjectModel) -> ObjectModel:
     return _MADE[model]
 
 
-def has_light_copy(model: ObjectModel) -> bool:
-    """Whether `light_copy` has nothing to make, which takes seconds and much memory."""
-    return len(model.faces) <= FACES or model in _MADE or cache_file("light", model, _VERSION).is_file()
-
-
 def drawn_copy(model: ObjectModel, side: int) -> ObjectModel:
     """What to draw of a model in pictures of ``side`` pixels (the longer one): the model, its light copy, or a still
     lighter one in templates."""

@@ -89,18 +89,9 @@ def has_bfloat16() -> bool:
     return "BF16" in openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
 
 
-def is_converted(digest: str) -> bool:
-    """Whether the network of these weights is kept, so that PyTorch is not needed."""
-    return (_kept(digest) / "svnet.xml").is_file()
-
-
-def _kept(digest: str) -> Path:
-    return user_cache("openvino") / f"{digest}-{__version__}-{openvino.__version__.split('-')[0]}"
-
-
 def _converted(svnet: Callable[[], LiteSVNet], digest: str) -> Any:
     """From the cache, else from PyTorch's network; an untrained one is not kept."""
-    kept = _kept(digest)
+    kept = user_cache("openvino") / f"{digest}-{__version__}-{openvino.__version__.split('-')[0]}"
     if digest == "untrained":
         return _convert(svnet())
     if not (kept / "svnet.xml").is_file():

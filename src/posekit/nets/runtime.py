@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -55,7 +54,6 @@ class Runtime:
         elif runtime == "openvino" and (self.preset != "lite" or self.device != "cpu"):
             raise ConfigError("OpenVINO runs the networks of preset lite, on the processor: leave --runtime torch.")
         self.runtime = runtime
-        self._starting: Future[Predictor] | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -81,23 +79,9 @@ class Runtime:
             torch.set_num_threads(count)
         return load_networks(*self._asked).moved(self.device)
 
-    def start(self) -> None:
-        """Begin to load `predictor` in a thread, where that takes half a second that can pass beside other work: with a
-        network converted for OpenVINO. What goes wrong is raised where the predictor is first used."""
-        if self.runtime == "openvino" and self._starting is None and "predictor" not in vars(self):
-            from posekit.nets.openvino import is_converted
-
-            if is_converted(self.digest):
-                loading = ThreadPoolExecutor(1, "posekit-network")
-                self._starting = loading.submit(self._predictor)
-                loading.shutdown(wait=False)
-
     @cached_property
     def predictor(self) -> Predictor:
         """SV-Net for batches of pairs."""
-        return self._predictor() if self._starting is None else self._starting.result()
-
-    def _predictor(self) -> Predictor:
         streams = min(STREAMS, threads() or usable_cores())
         return self.predictor_for(streams, streams)  # a thread for each: sums do not depend on the number of threads
 
