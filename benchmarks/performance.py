@@ -204,8 +204,8 @@ def estimating(frames: Frames) -> str:
 
 
 def searching(frames: Frames) -> str:
-    """Without a box: detecting and estimating, for the object that a picture shows, and for six of which it shows one;
-    after a picture that does not count."""
+    """Without a box: detecting and estimating, for the object that a picture shows, and for that one and others of
+    the data set, six in all where the pictures show so many; what is made once per mesh does not count."""
     chosen = sorted({int(k) for k in np.linspace(0, len(frames.keys) - 1, SEARCHED)})
     models = {model.name: model for _, model, _, _ in map(frames.get, range(len(frames.keys)))}
     detector, _ = make_detector(None, list(models.values()), doubtful=True)
