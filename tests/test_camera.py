@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -82,6 +83,18 @@ def test_a_zoomed_picture_shows_what_its_camera_sees() -> None:
     assert seen.mask is not None
     assert seen.mask[inside].all()
     np.testing.assert_allclose(seen.R_view_cam, zoom.R_view_cam)
+
+
+@pytest.mark.parametrize("middle", [(320, 240), (15, 20), (630, 400), (-150, 200), (-900, 240)])
+def test_where_it_shrinks_a_zoom_smooths_as_if_the_whole_picture_were_smoothed(middle: tuple[int, int]) -> None:
+    camera = Camera(500, 510, 315, 245, 640, 480)
+    noise = np.random.default_rng(3).integers(0, 256, (480, 640, 3)).astype(np.uint8)
+    zoom = Zoom.look_at(camera, camera.backproject(middle), 0.25, (40, 30))
+    smooth = cv2.GaussianBlur(noise, (0, 0), 0.4 * camera.fx / zoom.camera.fx)
+    expected = cv2.warpPerspective(smooth, zoom.homography, (40, 30), flags=cv2.INTER_LINEAR)
+    seen = View(noise, camera).zoomed(zoom)
+    assert np.abs(seen.image.astype(int) - expected).max() <= 1, "interpolation rounds to 1/32 of a pixel"
+    assert seen.image.any() == (middle[0] > -900)
 
 
 def test_boxes_are_edges() -> None:

@@ -56,25 +56,40 @@ class View:
         picture it is smoothed first, so that small details do not alias.
         """
         size, H = zoom.camera.size, zoom.homography
-        image = self.image
-        shrink = self.camera.fx / zoom.camera.fx
-        if shrink > 1.5:
-            image = cv2.GaussianBlur(image, (0, 0), 0.4 * shrink)
-        image = cv2.warpPerspective(image, H, size, flags=cv2.INTER_LINEAR)
+        image = self._image_in(zoom)
         mask = None
         if self.mask is not None:
             soft = cv2.warpPerspective(self.mask.astype(np.float32), H, size, flags=cv2.INTER_LINEAR)
             mask = soft > 0.5
         return View(image, zoom.camera, mask, R_view_cam=zoom.R_view_cam @ self.R_view_cam, valid=self._valid_in(zoom))
 
-    def _valid_in(self, zoom: Zoom) -> NDArray[np.bool_] | None:
-        """Which pixels of a zoomed picture take their colour from valid ones alone; None where all do."""
+    def _image_in(self, zoom: Zoom) -> NDArray[np.uint8]:
+        """The picture resampled into ``zoom.camera``; where it shrinks, what it shows is smoothed first."""
+        image, H, size = self.image, zoom.homography, zoom.camera.size
+        shrink = self.camera.fx / zoom.camera.fx
+        if shrink > 1.5:
+            sigma, places = 0.4 * shrink, self._corners(zoom)
+            if places is not None:
+                reach = int(np.ceil(3 * sigma)) + 2  # of the filter and of the interpolation
+                x0, y0 = np.clip(np.floor(places.min(0)) - reach, 0, self.camera.size).astype(int)
+                x1, y1 = np.clip(np.ceil(places.max(0)) + reach + 1, 0, self.camera.size).astype(int)
+                if x0 >= x1 or y0 >= y1:
+                    return np.zeros((size[1], size[0], 3), np.uint8)
+                image, H = image[y0:y1, x0:x1], H @ np.array([[1.0, 0, x0], [0, 1, y0], [0, 0, 1]])
+            image = np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), np.uint8)
+        return np.asarray(cv2.warpPerspective(image, H, size, flags=cv2.INTER_LINEAR), np.uint8)
+
+    def _corners(self, zoom: Zoom) -> NDArray[np.float64] | None:
+        """Where (4, 2) a zoom's corners lie in the picture; None where one of them is behind the camera."""
         width, height = zoom.camera.size
         corners = np.array([[0, 0, 1], [width - 1, 0, 1], [0, height - 1, 1], [width - 1, height - 1, 1]], np.float64)
         there = corners @ np.linalg.inv(zoom.homography).T
-        if self.valid is None and (there[:, 2] > 0).all():
-            places = there[:, :2] / there[:, 2:]
-            if (places >= 0).all() and (places <= np.array(self.camera.size) - 1).all():
-                return None
+        return there[:, :2] / there[:, 2:] if (there[:, 2] > 0).all() else None
+
+    def _valid_in(self, zoom: Zoom) -> NDArray[np.bool_] | None:
+        """Which pixels of a zoomed picture take their colour from valid ones alone; None where all do."""
+        places = self._corners(zoom) if self.valid is None else None
+        if places is not None and (places >= 0).all() and (places <= np.array(self.camera.size) - 1).all():
+            return None
         valid = self.shown.astype(np.float32)
         return np.asarray(cv2.warpPerspective(valid, zoom.homography, zoom.camera.size, flags=cv2.INTER_LINEAR) > 0.99)

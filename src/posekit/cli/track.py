@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from posekit.cli.output import Destination
     from posekit.io.pose_formats import NamedPose
     from posekit.io.video import Frame, Frames, VideoWriter
+    from posekit.tracking.group import TrackerGroup
     from posekit.tracking.tracker import Tracked, Tracker
 
 RECORDING = "track.rrd"
@@ -214,7 +215,9 @@ def _run(
     """Track every frame, and write each as soon as it is done: a killed run keeps its frames. keep: all poses, for
     formats that are written at the end."""
     from posekit.cli.output import named_pose
+    from posekit.tracking.group import TrackerGroup
 
+    group = TrackerGroup(trackers)
     counts, folder = _Counts(), None if destination.folder is None else destination.folder.path
     with ExitStack() as stack:
         lines = _Lines(destination, stack, counts)
@@ -230,7 +233,7 @@ def _run(
             if most is not None and done >= most:
                 break
             started = time.perf_counter()
-            results = _step(trackers, frame, counts)
+            results = _step(group, frame, counts)
             seconds = time.perf_counter() - started
             for k, (tracker, result) in enumerate(zip(trackers, results, strict=True)):
                 lines.write(frame, tracker.model.name, k, result, seconds)
@@ -282,15 +285,15 @@ class _Lines:
             self.table.write(_row(frame, _number(name, k), result, seconds) + "\n")
 
 
-def _step(trackers: Sequence[Tracker], frame: Frame, counts: _Counts) -> list[Tracked]:
+def _step(group: TrackerGroup, frame: Frame, counts: _Counts) -> list[Tracked]:
     from posekit.tracking.tracker import LOST, Tracked
 
     if frame.image is None or frame.camera is None:
         counts.problems.append(frame.problem)
-        results = [Tracked(LOST) for _ in trackers]
+        results = [Tracked(LOST) for _ in group.trackers]
     else:
         counts.used += 1
-        results = [tracker.step(frame.image, frame.camera, frame.valid) for tracker in trackers]
+        results = group.step(frame.image, frame.camera, frame.valid)
     for result in results:
         counts.states[result.state] = counts.states.get(result.state, 0) + 1
         counts.restarts += result.restarted

@@ -130,13 +130,16 @@ def crops(
     poses: Sequence[Pose],
     size: tuple[int, int],
     renderer: Renderer,
+    *,
+    rgb: bool = True,
     coords: bool = True,
 ) -> tuple[list[View], list[View]]:
-    """The photograph zoomed to each ``T_cam_obj``, and the object drawn there. size: (width, height)."""
+    """The photograph zoomed to each ``T_cam_obj``, and the object drawn there. size: (width, height). rgb, coords: as
+    `Renderer.render` has them."""
     zooms = [zoom_to_pose(view.camera, T @ model.T_obj_ctr, hull, size) for T in poses]
     observed = [view.zoomed(zoom) for zoom in zooms]
     turned = [Pose.rotation(zoom.R_view_cam) @ T for zoom, T in zip(zooms, poses, strict=True)]
-    return observed, renderer.render(model, turned, [z.camera for z in zooms], coords=coords)
+    return observed, renderer.render(model, turned, [z.camera for z in zooms], rgb=rgb, coords=coords)
 
 
 def update_pose(

@@ -10,7 +10,8 @@ from posekit.estimate.estimator import PoseEstimator
 from posekit.evaluate.truths import Truth
 from posekit.mesh.model import ObjectModel
 from posekit.results import Detection, Source
-from posekit.tracking.tracker import TrackConfig, Tracked, Tracker
+from posekit.tracking.group import TrackerGroup
+from posekit.tracking.tracker import TrackConfig, Tracker
 from posekit.view import View
 
 
@@ -31,30 +32,32 @@ class TrueMask:
 
 class Sequences:
     """One tracker for each object of the current scene; frames come in order. A lost object's true mask stands
-    for the detector. Objects that a scene has several times are followed once, the first of them."""
+    for the detector. Objects that a scene has several times are followed once, the first of them. Those of a scene
+    know where they hide each other, as with several ``--model`` of ``posekit track``."""
 
     def __init__(self, estimator: Callable[[int], PoseEstimator], runtime: str) -> None:
         self.estimator, self.config, self.scene = estimator, TrackConfig(runtime=runtime), -1
-        self.trackers: dict[int, tuple[Tracker, TrueMask]] = {}
+        self.group, self.masks = TrackerGroup([]), dict[int, TrueMask]()
 
     def step(self, scene: int, view: View, truths: Sequence[Truth], chosen: Sequence[Truth]) -> list[tuple[Any, ...]]:
         """(what was found, obj_id, the truth's index or None) of every object that is followed."""
         if scene != self.scene:
-            self.scene, self.trackers = scene, {}
+            self.scene, self.group, self.masks = scene, TrackerGroup([]), {}
         for truth in chosen:
-            if truth.instance.obj_id not in self.trackers:
+            if truth.instance.obj_id not in self.masks:
                 self._begin(truth)
-        return [self._one(obj_id, view, truths) for obj_id in self.trackers]
+        for obj_id, mask in self.masks.items():
+            mask.truth = next((t for t in truths if t.instance.obj_id == obj_id), None)
+        found = self.group.step(view.image, view.camera, view.valid)
+        indices = [None if mask.truth is None else mask.truth.instance.index for mask in self.masks.values()]
+        return list(zip(found, self.masks, indices, strict=True))
 
     def _begin(self, truth: Truth) -> None:
+        """The trackers are in the order of the masks."""
         estimator, mask = self.estimator(truth.instance.obj_id), TrueMask()
-        tracker = Tracker(
-            estimator.model, pose=truth.instance.T_cam_obj, estimator=estimator, detector=mask, config=self.config
+        self.group.trackers.append(
+            Tracker(
+                estimator.model, pose=truth.instance.T_cam_obj, estimator=estimator, detector=mask, config=self.config
+            )
         )
-        self.trackers[truth.instance.obj_id] = tracker, mask
-
-    def _one(self, obj_id: int, view: View, truths: Sequence[Truth]) -> tuple[Tracked, int, int | None]:
-        tracker, mask = self.trackers[obj_id]
-        mask.truth = next((t for t in truths if t.instance.obj_id == obj_id), None)
-        found = tracker.step(view.image, view.camera, view.valid)
-        return found, obj_id, None if mask.truth is None else mask.truth.instance.index
+        self.masks[truth.instance.obj_id] = mask

@@ -213,6 +213,7 @@ class Tracker:
         self._coarse = model.simplified(COARSE)
         self._outline = model.hull_ctr
         self._executor = ThreadPoolExecutor(1, "posekit-network")
+        self._last: Tracked | None = None
         self._given = pose  # a first pose that no frame has been compared with
         self._last_pose = pose  # the last ``T_cam_obj`` that was returned, whether or not the object was lost since
         self._state: GaussianPose | None = None  # ``T_cam_ctr``
@@ -236,12 +237,35 @@ class Tracker:
         self._searcher: ThreadPoolExecutor | None = None
         self._search_began = self._search_next = 0.0  # seconds of time.monotonic
 
+    @property
+    def last(self) -> Tracked | None:
+        """The result for the last frame; None before the first one."""
+        return self._last
+
+    @property
+    def expected(self) -> Pose | None:
+        """``T_cam_obj`` in the next frame if the last motion is repeated; None where the object is not followed."""
+        if self._state is None:
+            return None
+        last = self._state.pose
+        pose = Pose(self._motion.R @ last.R, last.t + self._motion.t) @ self.model.T_ctr_obj
+        return pose if self._in_front(pose) else None
+
+    @property
+    def drawn(self) -> ObjectModel:
+        """The mesh as it is drawn for a frame: with at most `FACES` faces."""
+        return self._drawn
+
     def step(
         self, image: NDArray[np.uint8], camera: Camera | None = None, valid: NDArray[np.bool_] | None = None
     ) -> Tracked:
         """The object in the next frame. image: uint8 RGB (H, W, 3). valid: as a `View` has it.
 
         Raises CameraError where no camera is known."""
+        self._last = self._step(image, camera, valid)
+        return self._last
+
+    def _step(self, image: NDArray[np.uint8], camera: Camera | None, valid: NDArray[np.bool_] | None) -> Tracked:
         chosen = camera or self.camera
         if chosen is None:
             raise CameraError("the tracker was made without a camera: pass one with each frame.")
@@ -304,7 +328,7 @@ class Tracker:
         assert self._colours is not None
         width, height = self.predictor.size
         size = (width // scale, height // scale)
-        [seen], [drawn] = crops(view, self._drawn, self._outline, [pose], size, self.renderer)
+        [seen], [drawn] = crops(view, self._drawn, self._outline, [pose], size, self.renderer, rgb=False)
         lines = outline_lines(seen, drawn, self._colours, self._colours.seen(seen), self.model.center)
         if lines is None:
             return 0.0
@@ -337,7 +361,7 @@ class Tracker:
             apart, known = self._off_colour(seen, drawn, T_view_ctr)
             apart = np.where(known[..., None], apart, tint.apart)
             other = tint.hides(apart, drawn.mask)
-            visible = colours.seen(seen) & ~other
+            visible = colours.seen(seen) & ~other & seen.shown
             answer = self._executor.submit(self._compared, seen, drawn, visible)
             # while the network computes
             keyframe = Keyframe(seen, drawn, T_view_ctr, visible)
@@ -462,7 +486,7 @@ class Tracker:
             return -1.0
         width, height = self.predictor.size
         size = (width // 2, height // 2)
-        [seen], [drawn] = crops(view, self._coarse, self._outline, [pose], size, self.renderer, coords=False)
+        [seen], [drawn] = crops(view, self._coarse, self._outline, [pose], size, self.renderer, rgb=False, coords=False)
         assert drawn.mask is not None
         return contrast(seen, drawn.mask, colours)
 
@@ -476,7 +500,7 @@ class Tracker:
             if not self._in_front(pose):
                 return start
             size, mesh = (width // scale, height // scale), self._drawn if scale == 1 else self._coarse
-            [seen], [drawn] = crops(view, mesh, self._outline, [pose], size, self.renderer)
+            [seen], [drawn] = crops(view, mesh, self._outline, [pose], size, self.renderer, rgb=False)
             lines = outline_lines(seen, drawn, colours, colours.seen(seen), self.model.center)
             if lines is None:
                 continue
@@ -566,7 +590,8 @@ class Tracker:
             return []
         doubt = (1 + (prediction.angle / ANGLE_OF_DOUBLE) ** 2) * (1 + (self._bias / BIASED) ** 2)
         scale = np.maximum(found.scale_px, LEAST_SCALE)
-        return [Points(points.astype(np.float64), found.target, found.weight, scale, KNEE, CORRELATED * doubt)]
+        weight = np.where(_shown_at(keyframe.seen, found.target), found.weight, 0.0)
+        return [Points(points.astype(np.float64), found.target, weight, scale, KNEE, CORRELATED * doubt)]
 
     def _disagreement(self, keyframe: Keyframe, prediction: PairPrediction, T_view_ctr: Pose) -> float:
         """How far, in pixels of the crop, the object's points lie in the pose that the network alone gives from where
@@ -811,7 +836,15 @@ def _moved_little(motion: Pose, pose: Pose, before: Keyframe | None) -> bool:
 def _predictor(estimator: PoseEstimator, config: TrackConfig) -> Predictor:
     if config.runtime == "torch" or estimator.runtime.runtime == "torch":
         return estimator.predictor
-    return estimator.runtime.predictor_for(1, max(1, usable_cores() // 2))  # the rest works beside it
+    return estimator.runtime.predictor_for(1, -(-3 * usable_cores() // 4))  # the tracker itself works beside it
+
+
+def _shown_at(view: View, pixels: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether a crop shows something at pixels (N, 2)."""
+    if view.valid is None:
+        return np.ones(len(pixels), np.bool_)
+    columns, rows = np.clip(np.rint(pixels).astype(int), 0, np.array(view.camera.size) - 1).T
+    return np.asarray(view.valid[rows, columns])
 
 
 def _before_camera(points: NDArray[np.float64]) -> NDArray[np.float64]:
