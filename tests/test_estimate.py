@@ -166,9 +166,10 @@ def test_an_exact_mask_finishes_the_pose(examples) -> None:
     np.testing.assert_array_equal(left.matrix, right.matrix)
 
 
-def test_the_score_prefers_small_angles_and_evidence() -> None:
-    assert hypothesis_score(0.5, 1.2) < hypothesis_score(0.02, 1.2)
-    assert hypothesis_score(0.02, 0.8) < hypothesis_score(0.02, 1.2)
+def test_the_score_prefers_small_angles_evidence_and_likeness() -> None:
+    assert hypothesis_score(0.5, 1.2, 0.5) < hypothesis_score(0.02, 1.2, 0.5)
+    assert hypothesis_score(0.02, 0.8, 0.5) < hypothesis_score(0.02, 1.2, 0.5)
+    assert hypothesis_score(0.02, 1.2, 0.4) < hypothesis_score(0.02, 1.2, 0.5)
 
 
 def test_what_is_not_there_is_doubted(examples) -> None:
@@ -180,11 +181,11 @@ def test_what_is_not_there_is_doubted(examples) -> None:
     assert shown.score > 0.8 > 0.4 > absent.score
     [again] = PoseEstimator(other).estimate(example.view, [detection], 1.0)
     assert again.score < 0.5 and again.iterations == 3 and not again.converged, "not refined to the end"
-    usual = existence_score(0.2, 2.0, 0.05)
-    assert 0 < existence_score(0.1, 2.0, 0.05) < usual < 1, "less alike"
-    assert existence_score(0.2, 4.0, 0.05) < usual, "less exact"
-    assert existence_score(0.2, 2.0, 0.1) < usual, "further off"
-    assert existence_score(0.2, 2.0, 0.0) == existence_score(0.2, 2.0, 1e-3), "no angle is too small"
+    usual = existence_score(0.6, 2.0, 0.05)
+    assert 0 < existence_score(0.5, 2.0, 0.05) < usual < 1, "less alike"
+    assert existence_score(0.6, 4.0, 0.05) < usual, "less exact"
+    assert existence_score(0.6, 2.0, 0.1) < usual, "further off"
+    assert existence_score(0.6, 2.0, 0.0) == existence_score(0.6, 2.0, 1e-3), "no angle is too small"
 
 
 def test_first_poses_come_from_both_masks(examples) -> None:

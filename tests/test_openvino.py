@@ -30,12 +30,24 @@ from posekit.view import View
 
 @pytest.fixture(scope="module")
 def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A user's cache with the converted network."""
+    """A user's cache with the converted networks."""
     cache = tmp_path_factory.mktemp("cache")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(cache))
-        _ = Runtime(runtime="openvino").predictor
+        runtime = Runtime(runtime="openvino")
+        _ = runtime.predictor, runtime.features
     return cache
+
+
+def test_both_runtimes_give_the_same_features(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(kept))
+    [folder] = (kept / "posekit" / "openvino").glob("lite0-*")
+    assert sorted(p.name for p in folder.iterdir()) == ["features.bin", "features.xml"]
+    pair = np.random.default_rng(0).random((2, 3, 96, 128), np.float32)
+    answers = [Runtime(runtime=runtime).features(pair) for runtime in ("openvino", "torch")]
+    assert answers[0].shape == (2, 40, 12, 16)
+    np.testing.assert_allclose(answers[0], answers[1], atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(answers[0], axis=1), 1.0, rtol=1e-5)
 
 
 def test_both_runtimes_answer_alike_and_the_conversion_is_kept(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,7 +19,7 @@ from posekit.cli.app import app
 from posekit.datasets.bop import BopDataset
 from posekit.detect.segmentation import encode, xywh
 from posekit.estimate.estimator import EstimateOptions, Estimators
-from posekit.estimate.instances import SearchOptions, estimates_of, find_instances, promising, scored_by_poses
+from posekit.estimate.instances import SearchOptions, find_instances, promising, scored_by_poses
 from posekit.evaluate import EvalOptions
 from posekit.evaluate.stages import ImageStage
 from posekit.evaluate.truths import Truth, TruthReader
@@ -112,6 +112,7 @@ def test_the_command_and_the_evaluation_find_the_same_poses(
 ) -> None:
     for place in ("posekit.detect.novel.make_detector", "posekit.evaluate.stages.make_detector"):
         monkeypatch.setattr(place, lambda *_, **__: (Oracles(root), ()))
+    monkeypatch.setattr("posekit.estimate.estimator.BIAS", 5.0)  # poses of untrained networks would be no instances
     found = measured(root, weights, str(file) if kind == "file" else kind)
     for truth in truths(root):
         obj_id, box = truth.instance.obj_id, truth.box_visib
@@ -206,17 +207,6 @@ def test_a_detection_belongs_to_the_model_of_its_label() -> None:
     first, second = find_instances(lambda _: fixed, VIEW, models, detections)
     assert (first.model, second.model) == tuple(models)
     assert [[e.score for e in f.instances] for f in (first, second)] == [[0.8, 0.7], [0.7, 0.6]]
-
-
-def test_the_likeness_to_the_mesh_counts_where_the_novel_detector_looked() -> None:
-    fixed = Fixed([0.6])
-    unlike, alike = (Detection(BOXES[0], None, s, "m", Source.NOVEL) for s in (0.46, 0.66))
-    found = [estimates_of(fixed, VIEW, [each], SearchOptions())[0].score for each in (unlike, alike)]
-    np.testing.assert_allclose(found, [0.6 / (0.6 + 0.4 * np.exp(2)), 0.6 / (0.6 + 0.4 * np.exp(-2))])
-    np.testing.assert_allclose(fixed.asked, [1 / (1 + np.exp(-2)), 1 / (1 + np.exp(2))])
-    for source in set(Source) - {Source.NOVEL}:
-        [same] = estimates_of(fixed, VIEW, [dataclasses.replace(alike, source=source)], SearchOptions())
-        assert same.score == 0.6
 
 
 @pytest.mark.parametrize("source", [Source.NOVEL, Source.TRAINED])

@@ -19,12 +19,13 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from posekit.camera import box_iou
-from posekit.detect.backbones import BACKBONES, LITE0_MEAN, LITE0_STD, feature_pyramid
+from posekit.detect.backbones import BACKBONES, feature_pyramid
 from posekit.detect.sharpen import sharpened
 from posekit.detect.vision import torchvision
 from posekit.errors import ConfigError, WeightsError
 from posekit.io.files import write_bytes_atomic, write_text_atomic
 from posekit.mesh.model import ObjectModel
+from posekit.nets.lite0 import LITE0_MEAN, LITE0_STD
 from posekit.results import Detection, Source
 from posekit.view import View
 

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from posekit.camera import Box, Camera, box_iou, mask_iou
 from posekit.detect import Detector
-from posekit.detect.backbones import LITE0_MEAN, LITE0_STD, Lite0, lite0_imagenet, load_lite0
 from posekit.detect.maskrcnn import COCO, DOUBTFUL, SHIPPED, MaskRCNN, TrainedDetector, find, load_coco, load_detector
 from posekit.detect.sharpen import sharpened
 from posekit.detect.similarity import with_similarity
@@ -31,6 +30,7 @@ from posekit.first_pose.features import FeatureSearch
 from posekit.first_pose.hypotheses import TemplateSearch
 from posekit.geometry import Pose, fibonacci_sphere, view_rotation
 from posekit.mesh.model import ObjectModel
+from posekit.nets.lite0 import LITE0_MEAN, LITE0_STD, Lite0, lite0_imagenet, load_lite0
 from posekit.render import Light, Renderer
 from posekit.results import Detection, Source
 from posekit.view import View

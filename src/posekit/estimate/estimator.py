@@ -16,14 +16,14 @@ from posekit.align.mask_edge import fit_mask_edge
 from posekit.camera import Box, mask_box
 from posekit.detect.similarity import USUAL, WEIGHT
 from posekit.errors import ConfigError
-from posekit.estimate.refine import Refinement, RefineOptions, compare, predicted_angle, refine, update_pose
+from posekit.estimate.perceptual import perceptual_similarity
+from posekit.estimate.refine import Refinement, RefineOptions, compare, crops, predicted_angle, refine, update_pose
 from posekit.first_pose.features import FeatureSearch
 from posekit.first_pose.hypotheses import (
     BoxSearch,
     EvidenceScorer,
     FirstPoseSearch,
     Hypothesis,
-    agreement_of,
     perturbed_poses,
 )
 from posekit.geometry import Pose, rotation_angle
@@ -42,11 +42,12 @@ SCREENED_POSES, SCREENED_EVIDENCE = 2, 2.0  # first poses of a detection that is
 COMPARED, COMPARED_EVIDENCE = 12, 6.0  # detections whose first poses the network compares; weight of their evidence
 INITS = ("templates", "mvnet")
 AUTO = "auto"  # correspondences where the network gives them, else the regressed delta
-STRUCTURE, BLUR, ANGLE, BIAS = 5.7, -1.6, -1.6, 1.2  # of `existence_score`, fitted: docs/decisions/0020
+LIKE, BLUR, ANGLE, BIAS = 15.1, -2.03, -1.03, -6.15  # of `existence_score`, fitted: docs/decisions/0027
 SMALLEST_ANGLE_DEG = 0.3  # degrees: smaller predicted errors say no more
 DEFAULT_SCALE_PX = 2.0  # pixels of the crop: the correspondences' expected error, where the network gives none
 FIRST, SEMIFINALISTS, PRUNING_ITERATIONS, FINALISTS = 1, 4, 3, 2  # iterations after which only so many hypotheses go on
 EVIDENCE_PER_RADIAN = 0.3  # evidence that outweighs a radian of predicted angle
+LIKENESS = 0.5  # weight of the perceptual similarity beside the evidence
 DIFFERENT = float(np.deg2rad(10.0))  # turn, or shift in diameters, from which an alternative is another pose
 PERTURBED = float(np.deg2rad(12.0))  # how far from a known pose others are tried
 
@@ -181,7 +182,7 @@ class PoseEstimator:
         updated = [update_pose(T, self.model, p, o, d, update) or T for T, p, o, d in compared]
         compared_again = zip(*compare(view, self.model, hull, updated, self.predictor, self.renderer), strict=True)
         for (k, hypothesis), (prediction, observed, rendered) in zip(found, compared_again, strict=True):
-            exists = _existence(prediction, observed, rendered, prediction.angle)
+            exists = self._existence(prediction, observed, rendered, prediction.angle)
             odds = np.log(max(exists, 1e-6) / max(1 - exists, 1e-6)) + SCREENED_EVIDENCE * hypothesis.score
             scores[k] = max(scores[k], odds)
         return scores.tolist()
@@ -223,9 +224,11 @@ class PoseEstimator:
         options = self.refine_options
         if len(starts) <= FINALISTS or options.iterations <= PRUNING_ITERATIONS:
             return refine(view, self.model, starts, self.predictor, self.renderer, options)
-        candidates = self._best(scorer, self._candidates(view, starts, FIRST), max(SEMIFINALISTS, self.options.top))
+        candidates = self._best(
+            view, scorer, self._candidates(view, starts, FIRST), max(SEMIFINALISTS, self.options.top)
+        )
         candidates = self._continued(view, candidates, PRUNING_ITERATIONS - FIRST)
-        if min_score > 0 and self._assess(view, self._best(scorer, candidates, 1)[0].T_cam_obj)[0] < min_score:
+        if min_score > 0 and self._assess(view, self._best(view, scorer, candidates, 1)[0].T_cam_obj)[0] < min_score:
             return candidates
         return self._finals(view, scorer, candidates)
 
@@ -239,11 +242,13 @@ class PoseEstimator:
 
     def _finals(self, view: View, scorer: EvidenceScorer, candidates: Sequence[Refinement]) -> list[Refinement]:
         """The best go on to the end."""
-        finalists = self._best(scorer, candidates, max(FINALISTS, self.options.top))
+        finalists = self._best(view, scorer, candidates, max(FINALISTS, self.options.top))
         return self._continued(view, finalists, self.refine_options.iterations - PRUNING_ITERATIONS)
 
-    def _best(self, scorer: EvidenceScorer, candidates: Sequence[Refinement], count: int) -> list[Refinement]:
-        scores = self._scores(scorer, candidates)
+    def _best(
+        self, view: View, scorer: EvidenceScorer, candidates: Sequence[Refinement], count: int
+    ) -> list[Refinement]:
+        scores = self._scores(view, scorer, candidates)
         order = np.argsort([-s for s in scores], kind="stable")
         for place, k in enumerate(order):
             log.debug(
@@ -289,7 +294,7 @@ class PoseEstimator:
     ) -> Estimate:
         """The hypothesis with the best score: much evidence in the photograph, and a low predicted angle. The next best
         ones that differ from it and from each other are its alternatives."""
-        first, *others = self._best(scorer, refined, len(refined) if self.options.top > 1 else 1)
+        first, *others = self._best(view, scorer, refined, len(refined) if self.options.top > 1 else 1)
         kept = [self._estimate_of(view, first, detection, timings)]
         for other in others:
             if len(kept) < self.options.top and all(self._differ(other.T_cam_obj, k.T_cam_obj) for k in kept):
@@ -341,11 +346,24 @@ class PoseEstimator:
         outlined = self.refine_options.colour_edge
         updated = update_pose(T_cam_obj, self.model, prediction, observed, rendered, update, outlined)
         angle = predicted_angle(T_cam_obj, prediction, updated, update)
-        return _existence(prediction, observed, rendered, angle), angle
+        return self._existence(prediction, observed, rendered, angle), angle
 
-    def _scores(self, scorer: EvidenceScorer, refined: Sequence[Refinement]) -> list[float]:
-        evidence = scorer.scores([r.T_cam_obj for r in refined])
-        return [hypothesis_score(r.angle, each) for r, each in zip(refined, evidence, strict=True)]
+    def _existence(self, prediction: PairPrediction, observed: View, rendered: View, angle: float) -> float:
+        """`existence_score` of a pose that was compared."""
+        found = prediction.correspondences
+        error = float(np.median(found.scale_px)) if found is not None and len(found.scale_px) else DEFAULT_SCALE_PX
+        visible = None if prediction.silhouettes is None else [prediction.silhouettes[0]]
+        [similarity] = perceptual_similarity(self.runtime.features, [observed], [rendered], visible)
+        return existence_score(similarity, error, angle)
+
+    def _scores(self, view: View, scorer: EvidenceScorer, refined: Sequence[Refinement]) -> list[float]:
+        poses = [r.T_cam_obj for r in refined]
+        observed, rendered = crops(
+            view, self.model, self.model.hull_ctr, poses, self.runtime.size, self.renderer, coords=False
+        )
+        similarities = perceptual_similarity(self.runtime.features, observed, rendered)
+        scored = zip(refined, scorer.scores(poses), similarities, strict=True)
+        return [hypothesis_score(r.angle, evidence, similarity) for r, evidence, similarity in scored]
 
     def _scorer_of(self, view: View, T_cam_obj: Pose) -> EvidenceScorer:
         """Of a known pose's surroundings."""
@@ -390,23 +408,17 @@ def nearest_to(reference: Pose, estimate: Estimate, model: ObjectModel, branch: 
     return replace(estimate, T_cam_obj=model.symmetries.nearest(estimate.T_cam_obj, reference), branch=branch)
 
 
-def _existence(prediction: PairPrediction, observed: View, rendered: View, angle: float) -> float:
-    """`existence_score` of a pose that was compared."""
-    found = prediction.correspondences
-    error = float(np.median(found.scale_px)) if found is not None and len(found.scale_px) else DEFAULT_SCALE_PX
-    return existence_score(agreement_of(observed, rendered).structure, error, angle)
+def hypothesis_score(angle: float, evidence: float, similarity: float) -> float:
+    """What hypotheses are chosen by, of a predicted angle (radians), the evidence and the perceptual similarity:
+    docs/decisions/0018 and 0027."""
+    return evidence + LIKENESS * similarity - EVIDENCE_PER_RADIAN * angle
 
 
-def hypothesis_score(angle: float, evidence: float) -> float:
-    """What hypotheses are chosen by, of a predicted angle (radians) and the evidence: docs/decisions/0018."""
-    return evidence - EVIDENCE_PER_RADIAN * angle
-
-
-def existence_score(structure: float, error_px: float, angle: float) -> float:
-    """Between 0 and 1: how likely it is that the object is there in this pose. structure: `Agreement`'s, how alike the
-    brightness gradients of picture and drawing are. error_px: median of the errors that the network expects of its
-    correspondences, pixels of the crop. angle: predicted rotation error, radians. A logistic function fitted to
-    estimates of objects, shown and not shown, in composed scenes: docs/decisions/0020."""
+def existence_score(similarity: float, error_px: float, angle: float) -> float:
+    """Between 0 and 1: how likely it is that the object is there in this pose. similarity: `perceptual_similarity` of
+    what is seen of it. error_px: median of the errors that the network expects of its correspondences, pixels of the
+    crop. angle: predicted rotation error, radians. A logistic function fitted to estimates of objects, shown and not
+    shown, in composed scenes: docs/decisions/0027."""
     degrees = max(float(np.rad2deg(angle)), SMALLEST_ANGLE_DEG)
-    total = STRUCTURE * structure + BLUR * np.log(error_px) + ANGLE * np.log(degrees) + BIAS
+    total = LIKE * similarity + BLUR * np.log(error_px) + ANGLE * np.log(degrees) + BIAS
     return float(1 / (1 + np.exp(-total)))

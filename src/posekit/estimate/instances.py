@@ -14,7 +14,7 @@ import numpy as np
 
 from posekit.camera import box_iou
 from posekit.detect.sharpen import sharpened
-from posekit.detect.similarity import USUAL, WEIGHT, shifted
+from posekit.detect.similarity import USUAL, WEIGHT
 from posekit.errors import ConfigError
 from posekit.mesh.model import ObjectModel
 from posekit.results import Detection, Estimate, Source
@@ -119,17 +119,12 @@ def estimates_of(
     estimator: Estimator, view: View, detections: Sequence[Detection], options: SearchOptions
 ) -> list[Estimate]:
     """An estimate for each detection that leads to one, in their order, until as many sure instances are found as are
-    wanted; detections by hand are all estimated. What the novel detector found is scored by
-    how much it looks like the mesh as well: a logistic function's argument grows by `WEIGHT` times what the similarity
-    is above `USUAL` (docs/decisions/0015)."""
+    wanted; detections by hand are all estimated."""
     found: list[Estimate] = []
     for detection in detections:
         if not detection.source.by_hand and _enough(found, options):
             break
-        shift = WEIGHT * (detection.score - USUAL) if detection.source is Source.NOVEL else 0.0
-        for estimate in estimator.estimate(view, [detection], shifted(options.min_score, -shift)):
-            others = tuple(replace(e, score=shifted(e.score, shift)) for e in estimate.alternatives)
-            found.append(replace(estimate, score=shifted(estimate.score, shift), alternatives=others))
+        found += estimator.estimate(view, [detection], options.min_score)
     return found
 
 

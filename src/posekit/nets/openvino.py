@@ -1,4 +1,5 @@
-"""SV-Net of the lite preset through OpenVINO: the same answers as PyTorch's, faster on a CPU.
+"""Networks through OpenVINO: the same answers as PyTorch's, faster on a CPU. SV-Net of the lite preset, and ImageNet's
+features.
 
 The converted network is kept in the user's cache (XDG_CACHE_HOME), by the weights' digest: converting takes seconds and
 PyTorch, running what was converted does not.
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from posekit._version import __version__
 from posekit.io.cache_folder import make_room
@@ -28,6 +30,8 @@ with without_telemetry():
     import openvino
 
 if TYPE_CHECKING:
+    from torch import Tensor, nn
+
     from posekit.nets.lite import LiteSVNet
 
 KEPT_NETWORKS = 3  # converted ones: of other weights, or other versions
@@ -63,7 +67,8 @@ class OpenVinoPredictor:
         }
         if digest != "untrained":  # what is compiled for this processor is kept, too
             options["CACHE_DIR"] = str(user_cache("openvino/compiled"))
-        compiled = openvino.Core().compile_model(_converted(svnet, digest), "CPU", options)
+        model = _converted(lambda: _convert(svnet()), digest, "svnet.xml")
+        compiled = openvino.Core().compile_model(model, "CPU", options)
         make_room(user_cache("openvino/compiled").glob("*.blob"), KEPT_BLOBS)
         self._queue = openvino.AsyncInferQueue(compiled, streams)
         answers: dict[int, list[Any]] = {}
@@ -89,23 +94,49 @@ def has_bfloat16() -> bool:
     return "BF16" in openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
 
 
-def _converted(svnet: Callable[[], LiteSVNet], digest: str) -> Any:
-    """From the cache, else from PyTorch's network; an untrained one is not kept."""
+class OpenVinoFeatures:
+    """ImageNet's early features of pairs of pictures (`posekit.nets.lite0.EarlyFeatures`), on the processor.
+
+    size: (width, height) of the pictures. network: gives PyTorch's, where it has to be converted. threads: as
+    `OpenVinoPredictor` has them. Not thread-safe.
+    """
+
+    def __init__(self, network: Callable[[], nn.Module], size: tuple[int, int], threads: int | None = None) -> None:
+        def convert() -> Any:
+            import torch
+
+            return _traced(network(), (torch.zeros(2, 3, size[1], size[0]),))
+
+        options: dict[str, Any] = {
+            "INFERENCE_PRECISION_HINT": "f32",
+            "INFERENCE_NUM_THREADS": threads or usable_cores(),
+            "CACHE_DIR": str(user_cache("openvino/compiled")),
+        }
+        model = _converted(convert, f"lite0-{size[0]}x{size[1]}", "features.xml")
+        self._compiled = openvino.Core().compile_model(model, "CPU", options)
+
+    def __call__(self, pictures: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(2, 3, H, W) in [0, 1] -> (2, C, H / 8, W / 8)."""
+        return np.array(self._compiled([pictures])[0], np.float32)
+
+
+def _converted(convert: Callable[[], Any], digest: str, name: str) -> Any:
+    """From the cache, else converted and kept there, unless the digest is that of an untrained network."""
     kept = user_cache("openvino") / f"{digest}-{__version__}-{openvino.__version__.split('-')[0]}"
     if digest == "untrained":
-        return _convert(svnet())
-    if not (kept / "svnet.xml").is_file():
-        model = _convert(svnet())
+        return convert()
+    if not (kept / name).is_file():
+        model = convert()
         try:
-            _keep(model, kept)
+            _keep(model, kept, name)
         except OSError:  # a cache that cannot be written costs time only
             return model
-    return openvino.Core().read_model(kept / "svnet.xml")  # the first time too: its rounding differs a little
+    return openvino.Core().read_model(kept / name)  # the first time too: its rounding differs a little
 
 
 def _convert(svnet: LiteSVNet) -> Any:
     import torch
-    from torch import Tensor, nn
+    from torch import nn
 
     from posekit.nets.pytorch import answers
 
@@ -123,20 +154,27 @@ def _convert(svnet: LiteSVNet) -> Any:
     rendered = torch.zeros(1, 4, height, width)
     rendered[:, 3, height // 4 : -height // 4, width // 4 : -width // 4] = 1.0
     example = (rendered[:, :3], rendered, torch.zeros(1, height, width), torch.ones(1))
+    return _traced(Answers(), example)
+
+
+def _traced(network: nn.Module, example: tuple[Tensor, ...]) -> Any:
+    """PyTorch's network for inputs of these sizes."""
+    import torch
+
     with torch.inference_mode(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of sizes that become constants: a crop's size is one
-        traced = torch.jit.trace(Answers().eval(), example, check_trace=False)
+        traced = torch.jit.trace(network.eval(), example, check_trace=False)
     with without_telemetry():
         return openvino.convert_model(traced, example_input=example, input=[list(x.shape) for x in example])
 
 
-def _keep(model: Any, folder: Path) -> None:
+def _keep(model: Any, folder: Path, name: str) -> None:
     """As a whole or not at all."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     part = Path(tempfile.mkdtemp(dir=folder.parent))
     try:
-        openvino.save_model(model, part / "svnet.xml", compress_to_fp16=False)
+        openvino.save_model(model, part / name, compress_to_fp16=False)
         part.rename(folder)
-        make_room((p for p in folder.parent.iterdir() if (p / "svnet.xml").is_file()), KEPT_NETWORKS)
+        make_room((p for p in folder.parent.iterdir() if (p / name).is_file()), KEPT_NETWORKS)
     finally:
         shutil.rmtree(part, ignore_errors=True)

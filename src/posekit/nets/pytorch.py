@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from posekit.nets.heads import Prediction
 from posekit.nets.inputs import relief, to_input
 from posekit.nets.lite import LiteSVNet
+from posekit.nets.lite0 import EarlyFeatures
 from posekit.nets.precision import has_fast_bfloat16
 from posekit.nets.predictor import PairPrediction, unpack
 from posekit.nets.weights import Networks
@@ -49,3 +51,14 @@ def answers(out: Prediction) -> tuple[Tensor | None, ...]:
     """The fields of a prediction in the order that `unpack` takes them."""
     return (out.quat_wxyz, out.v, out.angle, out.flow, out.log_scale, out.visibility, out.certainty, out.silhouettes,
             out.score)  # fmt: skip
+
+
+def torch_features(device: str) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
+    """`EarlyFeatures` on a device, as a function of arrays (B, 3, H, W). Raises WeightsError."""
+    network = EarlyFeatures().to(device)
+
+    def features(pictures: NDArray[np.float32]) -> NDArray[np.float32]:
+        with torch.inference_mode():
+            return np.asarray(network(torch.from_numpy(pictures).to(device)).cpu().numpy(), np.float32)
+
+    return features

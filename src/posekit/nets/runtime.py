@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from posekit.errors import ConfigError
 from posekit.nets.config import LiteConfig, WeightsFile
@@ -15,6 +18,8 @@ from posekit.nets.predictor import Predictor
 from posekit.nets.telemetry import without_telemetry
 
 if TYPE_CHECKING:
+    from torch import nn
+
     from posekit.nets.weights import Networks
 
 log = logging.getLogger("posekit")
@@ -98,6 +103,24 @@ class Runtime:
             return self.networks.svnet
 
         return OpenVinoPredictor(svnet, self.digest, self.size, bfloat16=has_bfloat16(), threads=count, streams=streams)
+
+    @cached_property
+    def features(self) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
+        """ImageNet's early features of a pair of crops of SV-Net's size: (2, 3, H, W) in [0, 1] -> (2, C, H / 8,
+        W / 8), each cell's of unit length. Raises WeightsError where ImageNet's weights are missing."""
+        if self.runtime == "torch":
+            from posekit.nets.pytorch import torch_features
+
+            return torch_features(self.device)
+        from posekit.nets.openvino import OpenVinoFeatures
+
+        return OpenVinoFeatures(_early_features, self.size, threads())
+
+
+def _early_features() -> nn.Module:
+    from posekit.nets.lite0 import EarlyFeatures
+
+    return EarlyFeatures()
 
 
 def _has_openvino() -> bool:
