@@ -1,13 +1,14 @@
 """What tells a right pose from a wrong one: measures of estimates whose truth is known, and a logistic fit to them.
 
-    python benchmarks/existence.py collect ROOT --split train --out FILE.jsonl [--proposals] [--scans] [--images 40]
-    python benchmarks/existence.py fit FILE.jsonl ... --measures structure,blur,angle
+    python benchmarks/existence.py collect ROOT --split train --out FILE.jsonl [--proposals] [--scans] [--plain]
+    python benchmarks/existence.py fit FILE.jsonl ... --measures similarity,blur,angle
 
 `collect` estimates poses in a data set in BOP layout, at boxes of which every edge is wrong by up to 5 %, each box
 asked for the object shown and for another one; with ``--proposals`` at the novel detector's best proposals of each
-mesh. ``--scans``: the estimator is given a scan (`posekit.synth.appearance.scanned`) instead of the mesh. An
-estimate is right within 10 degrees and a quarter of the diameter, counting symmetries. `fit` weighs right and wrong
-alike, and prints the coefficients, the area under the curve in five folds, and how many are accepted at 0.5.
+mesh. ``--scans``: the estimator is given a scan (`posekit.synth.appearance.scanned`) instead of the mesh; ``--plain``:
+one without colours. An estimate is right within 10 degrees and a quarter of the diameter, counting symmetries. `fit`
+weighs right and wrong alike, and prints the coefficients, the area under the curve in five folds, and how many are
+accepted at 0.5.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +30,9 @@ from posekit.detect.novel import make_detector
 from posekit.detect.prompts import clip_box
 from posekit.estimate.estimator import Estimators, PoseEstimator
 from posekit.estimate.instances import promising
+from posekit.estimate.perceptual import perceptual_similarity
 from posekit.estimate.refine import compare, predicted_angle, update_pose
-from posekit.first_pose.hypotheses import EvidenceScorer, agreement_of
+from posekit.first_pose.hypotheses import EvidenceScorer
 from posekit.geometry import rotation_angle
 from posekit.metrics import pose_error
 from posekit.results import Detection, Estimate
@@ -48,7 +51,7 @@ def measures_of(estimator: PoseEstimator, view: View, found: Estimate) -> dict[s
     updated = update_pose(pose, model, prediction, observed, drawn, options.update, options.colour_edge)
     alone = update_pose(pose, model, prediction, observed, drawn, options.update)
     angle = predicted_angle(pose, prediction, updated, options.update)
-    agreement = agreement_of(observed, drawn)
+    features = estimator.runtime.features
     points = prediction.correspondences
     assert points is not None and prediction.silhouettes is not None and drawn.mask is not None
     share = drawn.mask.reshape(drawn.mask.shape[0] // 4, 4, -1, 4).mean((1, 3))
@@ -58,8 +61,8 @@ def measures_of(estimator: PoseEstimator, view: View, found: Estimate) -> dict[s
     size = max(box[2] - box[0], box[3] - box[1])
     return {
         "evidence": scorer.scores([pose])[0],
-        "structure": agreement.structure,
-        "colour": agreement.colour,
+        "similarity": perceptual_similarity(features, [observed], [drawn], [prediction.silhouettes[0]])[0],
+        "similarity_whole": perceptual_similarity(features, [observed], [drawn])[0],
         "blur": float(np.log(np.median(points.scale_px))) if len(points.scale_px) else 2.0,
         "angle": float(np.log(max(np.rad2deg(angle), 0.3))),
         "head": float(np.log(max(np.rad2deg(prediction.angle), 0.3))),
@@ -95,6 +98,8 @@ def collect(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
     data, rng = BopDataset(args.root, split=args.split), np.random.default_rng(args.seed)
     models = {k: data.model(k) for k in data.model_ids()}
     given = {k: scanned(m, rng) if args.scans else m for k, m in models.items()}
+    if args.plain:
+        given = {k: replace(m, colors=None, uvs=None, texture=None) for k, m in given.items()}
     estimators, pictures = Estimators(), data.images()
     detector, _ = make_detector("novel", list(given.values()), doubtful=True) if args.proposals else (None, None)
     chosen = np.linspace(0, len(pictures) - 1, min(args.images, len(pictures))).astype(int)
@@ -110,7 +115,7 @@ def collect(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
                 visible = max((i.visib_fract for i in same if box_iou(found.box, i.box_visib or found.box) > 0.3),
                               default=0.0)  # fmt: skip
                 row = {"picture": str(pictures[k]), "object": obj_id, "right": right, "degrees": turn,
-                       "diameters": shift, "similarity": detection.score, "score": found.score,
+                       "diameters": shift, "detection": detection.score, "score": found.score,
                        "visible_share": visible}  # fmt: skip
                 yield row | {"measures": measures_of(estimators(model), view, found)}
 
@@ -186,8 +191,9 @@ def main() -> None:
     parser.add_argument("--proposals", action="store_true")
     parser.add_argument("--candidates", type=int, default=3)
     parser.add_argument("--scans", action="store_true")
+    parser.add_argument("--plain", action="store_true")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--measures", default="structure,blur,angle", help="fit: joined by commas; sets by semicolons")
+    parser.add_argument("--measures", default="similarity,blur,angle", help="fit: joined by commas; sets by semicolons")
     args = parser.parse_args()
     if args.what == "collect":
         args.root = args.files[0]

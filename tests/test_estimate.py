@@ -186,6 +186,7 @@ def test_what_is_not_there_is_doubted(examples) -> None:
     assert existence_score(0.6, 4.0, 0.05) < usual, "less exact"
     assert existence_score(0.6, 2.0, 0.1) < usual, "further off"
     assert existence_score(0.6, 2.0, 0.0) == existence_score(0.6, 2.0, 1e-3), "no angle is too small"
+    assert existence_score(0.4, 2.0, 0.05, coloured=False) > existence_score(0.4, 2.0, 0.05), "colours look unlike"
 
 
 def test_first_poses_come_from_both_masks(examples) -> None:

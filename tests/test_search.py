@@ -112,7 +112,8 @@ def test_the_command_and_the_evaluation_find_the_same_poses(
 ) -> None:
     for place in ("posekit.detect.novel.make_detector", "posekit.evaluate.stages.make_detector"):
         monkeypatch.setattr(place, lambda *_, **__: (Oracles(root), ()))
-    monkeypatch.setattr("posekit.estimate.estimator.BIAS", 5.0)  # poses of untrained networks would be no instances
+    likely = (15.4, -1.97, -0.94, 5.0)  # poses of untrained networks would be no instances
+    monkeypatch.setattr("posekit.estimate.estimator.EXISTENCE", likely)
     found = measured(root, weights, str(file) if kind == "file" else kind)
     for truth in truths(root):
         obj_id, box = truth.instance.obj_id, truth.box_visib

@@ -266,7 +266,7 @@ def limits(model: ObjectModel, estimates: Sequence[Estimate], symmetry: str = "n
             f"{model.name} looks the same after {in_words(symmetry)}, so that several poses fit equally well and any "
             f"of them may be given: pass --symmetry {symmetry} to have it considered, or --symmetry none."
         )
-    if estimates and model.colors is None and model.texture is None:
+    if estimates and not model.coloured:
         notes.append(
             f"{model.name} has no colours: only its shape is compared, and a turn that leaves the silhouette as it is "
             "may go unseen. A mesh with vertex colours or a texture helps."

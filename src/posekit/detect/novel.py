@@ -257,7 +257,7 @@ class SimilarityDetector:
         found = self.detector.detect(view, models)
         for model in models:
             mine = [k for k, each in enumerate(found) if each.label == model.name]
-            if not mine or (model.colors is None and model.texture is None):
+            if not mine or not model.coloured:
                 continue
             proposals = [found[k] for k in mine]
             similarities = self.similarity.of(view, model, proposals, self.similarity.appearance(view, proposals))

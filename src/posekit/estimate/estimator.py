@@ -42,7 +42,8 @@ SCREENED_POSES, SCREENED_EVIDENCE = 2, 2.0  # first poses of a detection that is
 COMPARED, COMPARED_EVIDENCE = 12, 6.0  # detections whose first poses the network compares; weight of their evidence
 INITS = ("templates", "mvnet")
 AUTO = "auto"  # correspondences where the network gives them, else the regressed delta
-LIKE, BLUR, ANGLE, BIAS = 15.1, -2.03, -1.03, -6.15  # of `existence_score`, fitted: docs/decisions/0027
+# of `existence_score`, fitted: similarity, logarithms of expected error and angle, constant; docs/decisions/0027
+EXISTENCE, EXISTENCE_PLAIN = (15.4, -1.97, -0.94, -6.53), (9.7, -0.80, -1.85, -0.72)
 SMALLEST_ANGLE_DEG = 0.3  # degrees: smaller predicted errors say no more
 DEFAULT_SCALE_PX = 2.0  # pixels of the crop: the correspondences' expected error, where the network gives none
 FIRST, SEMIFINALISTS, PRUNING_ITERATIONS, FINALISTS = 1, 4, 3, 2  # iterations after which only so many hypotheses go on
@@ -354,7 +355,7 @@ class PoseEstimator:
         error = float(np.median(found.scale_px)) if found is not None and len(found.scale_px) else DEFAULT_SCALE_PX
         visible = None if prediction.silhouettes is None else [prediction.silhouettes[0]]
         [similarity] = perceptual_similarity(self.runtime.features, [observed], [rendered], visible)
-        return existence_score(similarity, error, angle)
+        return existence_score(similarity, error, angle, coloured=self.model.coloured)
 
     def _scores(self, view: View, scorer: EvidenceScorer, refined: Sequence[Refinement]) -> list[float]:
         poses = [r.T_cam_obj for r in refined]
@@ -414,11 +415,12 @@ def hypothesis_score(angle: float, evidence: float, similarity: float) -> float:
     return evidence + LIKENESS * similarity - EVIDENCE_PER_RADIAN * angle
 
 
-def existence_score(similarity: float, error_px: float, angle: float) -> float:
+def existence_score(similarity: float, error_px: float, angle: float, *, coloured: bool = True) -> float:
     """Between 0 and 1: how likely it is that the object is there in this pose. similarity: `perceptual_similarity` of
     what is seen of it. error_px: median of the errors that the network expects of its correspondences, pixels of the
-    crop. angle: predicted rotation error, radians. A logistic function fitted to estimates of objects, shown and not
-    shown, in composed scenes: docs/decisions/0027."""
+    crop. angle: predicted rotation error, radians. coloured: whether the mesh has colours. A logistic function fitted
+    to estimates of objects, shown and not shown, in composed scenes: docs/decisions/0027."""
     degrees = max(float(np.rad2deg(angle)), SMALLEST_ANGLE_DEG)
-    total = LIKE * similarity + BLUR * np.log(error_px) + ANGLE * np.log(degrees) + BIAS
+    weights = np.array(EXISTENCE if coloured else EXISTENCE_PLAIN)
+    total = float(weights @ [similarity, np.log(error_px), np.log(degrees), 1.0])
     return float(1 / (1 + np.exp(-total)))

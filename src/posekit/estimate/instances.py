@@ -42,8 +42,8 @@ class SearchOptions:
     instances: int = 1  # kept at most; 0 = all
     min_score: float = 0.5  # score of an estimate below which it is no instance
     overlap: float = 0.5  # of the boxes (intersection over union) from which two estimates are of one instance
-    candidates: int = 3  # the novel detector's detections that are estimated, the most promising ones
-    sure: float = 0.98  # score from which an estimate is an instance whatever the remaining detections would give
+    candidates: int = 5  # the novel detector's detections that are estimated, the most promising ones
+    sure: float = 0.95  # score from which an estimate is an instance whatever the remaining detections would give
 
     def __post_init__(self) -> None:
         shares = (self.min_score, self.sure)

@@ -457,56 +457,9 @@ def perturbed_poses(T_cam_obj: Pose, model: ObjectModel, angle: float) -> list[P
     return [T @ model.T_ctr_obj for T in turned]
 
 
-@dataclass(frozen=True)
-class Agreement:
-    """How well a pose explains a photograph, measured by rendering it there.
-
-    silhouette: intersection over union with the observed mask, 1 where there is none. colour: correlation of the
-    rendered and the observed colours inside the silhouette, brightness and contrast taken out, -1 to 1. structure: how
-    alike the two brightness gradients are inside the silhouette, -1 to 1, flat places counting little.
-    """
-
-    silhouette: float
-    colour: float
-    structure: float = 0.0
-
-
-def agreement_of(observed: View, rendered: View) -> Agreement:
-    """Of a photograph's crop and the object drawn for the same camera."""
-    assert rendered.mask is not None
-    structure = _structure(observed, rendered)
-    inside, silhouette = rendered.mask, 1.0
-    if observed.mask is not None:
-        silhouette = float((inside & observed.mask).sum() / max(1, (inside | observed.mask).sum()))
-        inside = inside & observed.mask
-    if inside.sum() < 30:
-        return Agreement(silhouette, -1.0, structure)
-    a, b = (v.image[inside].astype(np.float64) for v in (observed, rendered))
-    a, b = a - a.mean(0), b - b.mean(0)
-    colour = float((a * b).sum() / (np.linalg.norm(a) * np.linalg.norm(b) + 1e-9))
-    return Agreement(silhouette, colour, structure)
-
-
-def _structure(observed: View, rendered: View) -> float:
-    assert rendered.mask is not None
-    inside = cv2.erode(rendered.mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    if not inside.any():
-        return 0.0
-    a, b = _gradients(observed.image)[inside], _gradients(rendered.image)[inside]
-    lengths = (np.linalg.norm(a, axis=1) + FLAT) * (np.linalg.norm(b, axis=1) + FLAT)
-    return float(((a * b).sum(axis=1) / lengths).mean())
-
-
-def _gradients(image: NDArray[np.uint8]) -> FArray:
-    """Sobel's, of the slightly blurred brightness, (H, W, 2)."""
-    grey = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1.0)
-    return np.dstack([cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)])
-
-
 def weights_for(model: ObjectModel, weights: Weights) -> Weights:
     """Without the colour agreement for a mesh without colours: its shading depends on a light that nobody knows."""
-    plain = model.colors is None and model.texture is None
-    return replace(weights, agreement=0.0) if plain else weights
+    return weights if model.coloured else replace(weights, agreement=0.0)
 
 
 def _u8(mask: NDArray[np.bool_] | None) -> NDArray[np.uint8]:

@@ -174,6 +174,11 @@ class ObjectModel:
             symmetries=symmetries or Symmetries.none(),
         )
 
+    @property
+    def coloured(self) -> bool:
+        """Whether it has a texture or colours of its own."""
+        return self.colors is not None or self.texture is not None
+
     @cached_property
     def bounds(self) -> Floats:
         """(2, 3), the bounding box's lower and upper corner in ``obj``."""

@@ -538,11 +538,7 @@ class Tracker:
 
     def _to_be_learned(self, seen: View, drawn: View, visible: NDArray[np.bool_]) -> bool:
         """Whether a first frame does not have the mesh's colours."""
-        return self.config.appearance and not (self._coloured and colours_agree(seen, drawn, visible))
-
-    @property
-    def _coloured(self) -> bool:
-        return self.model.colors is not None or self.model.texture is not None
+        return self.config.appearance and not (self.model.coloured and colours_agree(seen, drawn, visible))
 
     def _off_colour(self, seen: View, drawn: View, T_view_ctr: Pose) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """`off_colour` of a crop, and where (H, W) the object's colours are known: everywhere by the mesh; where the
@@ -553,7 +549,7 @@ class Tracker:
         return off_colour(seen, replace(drawn, image=image)), known
 
     def _texture(self, keyframe: Keyframe) -> list[Residual]:
-        found = match_texture(keyframe, self.model) if self.config.texture and self._coloured else None
+        found = match_texture(keyframe, self.model) if self.config.texture and self.model.coloured else None
         return [] if found is None else [found]
 
     def _lines(self, keyframe: Keyframe, seen: View, visible: NDArray[np.bool_], colours: Colours) -> list[Residual]:
