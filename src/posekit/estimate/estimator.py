@@ -48,7 +48,7 @@ SMALLEST_ANGLE_DEG = 0.3  # degrees: smaller predicted errors say no more
 DEFAULT_SCALE_PX = 2.0  # pixels of the crop: the correspondences' expected error, where the network gives none
 FIRST, SEMIFINALISTS, PRUNING_ITERATIONS, FINALISTS = 1, 4, 3, 2  # iterations after which only so many hypotheses go on
 EVIDENCE_PER_RADIAN = 0.3  # evidence that outweighs a radian of predicted angle
-LIKENESS = 0.5  # weight of the perceptual similarity beside the evidence
+SIMILARITY = 0.5  # weight of the perceptual similarity beside the evidence
 DIFFERENT = float(np.deg2rad(10.0))  # turn, or shift in diameters, from which an alternative is another pose
 PERTURBED = float(np.deg2rad(12.0))  # how far from a known pose others are tried
 
@@ -221,7 +221,8 @@ class PoseEstimator:
     def _refined(
         self, view: View, scorer: EvidenceScorer, starts: Sequence[Pose], min_score: float
     ) -> list[Refinement]:
-        """Every start for a few iterations, and the best of them to the end, unless its score is below ``least``."""
+        """Every start for a few iterations, and the best of them to the end, unless its score is below
+        ``min_score``."""
         options = self.refine_options
         if len(starts) <= FINALISTS or options.iterations <= PRUNING_ITERATIONS:
             return refine(view, self.model, starts, self.predictor, self.renderer, options)
@@ -293,8 +294,8 @@ class PoseEstimator:
         detection: Detection | None,
         timings: dict[str, float],
     ) -> Estimate:
-        """The hypothesis with the best score: much evidence in the photograph, and a low predicted angle. The next best
-        ones that differ from it and from each other are its alternatives."""
+        """The hypothesis that `hypothesis_score` puts first. The next best ones that differ from it and from each other
+        are its alternatives."""
         first, *others = self._best(view, scorer, refined, len(refined) if self.options.top > 1 else 1)
         kept = [self._estimate_of(view, first, detection, timings)]
         for other in others:
@@ -412,7 +413,7 @@ def nearest_to(reference: Pose, estimate: Estimate, model: ObjectModel, branch: 
 def hypothesis_score(angle: float, evidence: float, similarity: float) -> float:
     """What hypotheses are chosen by, of a predicted angle (radians), the evidence and the perceptual similarity:
     docs/decisions/0018 and 0027."""
-    return evidence + LIKENESS * similarity - EVIDENCE_PER_RADIAN * angle
+    return evidence + SIMILARITY * similarity - EVIDENCE_PER_RADIAN * angle
 
 
 def existence_score(similarity: float, error_px: float, angle: float, *, coloured: bool = True) -> float:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from posekit.camera import Camera
 from posekit.errors import CameraError
+from posekit.geometry import Pose
 from posekit.render import Renderer
 from posekit.tracking.tracker import TRACKED, Tracked, Tracker
 from posekit.view import View
@@ -46,14 +47,14 @@ class TrackerGroup:
         has it. Raises CameraError where no camera is known."""
         if len(self.trackers) < 2:
             return [tracker.step(image, camera, valid) for tracker in self.trackers]
-        cameras = [camera or tracker.camera for tracker in self.trackers]
-        if cameras[0] is None:
+        known = camera or self.trackers[0].camera
+        if known is None:
             raise CameraError("the trackers were made without a camera: pass one with each frame.")
-        hidden = self.hidden(cameras[0])
+        hidden = self.hidden(known)
         masks = [valid if each is None else ~each if valid is None else valid & ~each for each in hidden]
         steps = [
-            self._threads.submit(tracker.step, image, own, mask)
-            for tracker, own, mask in zip(self.trackers, cameras, masks, strict=True)
+            self._threads.submit(tracker.step, image, known, mask)
+            for tracker, mask in zip(self.trackers, masks, strict=True)
         ]
         return [step.result() for step in steps]
 
@@ -63,19 +64,19 @@ class TrackerGroup:
         in the last frame hide others."""
         width = min(WIDTH, camera.width)
         small = camera.resized(width, max(1, round(camera.height * width / camera.width)))
-        drawn = [self._drawn(tracker, small) for tracker in self.trackers]
-        return [self._behind(k, drawn, camera) for k in range(len(drawn))]
+        poses = [tracker.expected for tracker in self.trackers]
+        drawn = [self._drawn(tracker, pose, small) for tracker, pose in zip(self.trackers, poses, strict=True)]
+        return [self._behind(k, pose, drawn, camera) for k, pose in enumerate(poses)]
 
-    def _drawn(self, tracker: Tracker, camera: Camera) -> View | None:
-        pose = tracker.expected
+    def _drawn(self, tracker: Tracker, pose: Pose | None, camera: Camera) -> View | None:
         if pose is None:
             return None
         [drawn] = self._renderer.render(tracker.drawn, [pose], camera, rgb=False)
         return drawn
 
-    def _behind(self, k: int, drawn: Sequence[View | None], camera: Camera) -> Mask | None:
-        """Of the k-th object."""
-        own, pose = drawn[k], self.trackers[k].expected
+    def _behind(self, k: int, pose: Pose | None, drawn: Sequence[View | None], camera: Camera) -> Mask | None:
+        """Of the k-th object, at a ``T_cam_obj``."""
+        own = drawn[k]
         if own is None or pose is None:
             return None
         assert own.mask is not None and own.depth is not None

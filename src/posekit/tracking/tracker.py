@@ -245,7 +245,7 @@ class Tracker:
     @property
     def expected(self) -> Pose | None:
         """``T_cam_obj`` in the next frame if the last motion is repeated; None where the object is not followed."""
-        if self._state is None:
+        if self._state is None or self._searching is not None:  # a search has the state to itself
             return None
         last = self._state.pose
         pose = Pose(self._motion.R @ last.R, last.t + self._motion.t) @ self.model.T_ctr_obj
@@ -832,7 +832,7 @@ def _moved_little(motion: Pose, pose: Pose, before: Keyframe | None) -> bool:
 def _predictor(estimator: PoseEstimator, config: TrackConfig) -> Predictor:
     if config.runtime == "torch" or estimator.runtime.runtime == "torch":
         return estimator.predictor
-    return estimator.runtime.predictor_for(1, -(-3 * usable_cores() // 4))  # the tracker itself works beside it
+    return estimator.runtime.predictor_for(1, math.ceil(0.75 * usable_cores()))  # the tracker itself works beside it
 
 
 def _shown_at(view: View, pixels: NDArray[np.float64]) -> NDArray[np.bool_]:
